@@ -1,0 +1,1 @@
+//! The per-host agent: supervises federates and the RTI, serves the API.

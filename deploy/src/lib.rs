@@ -1,0 +1,1 @@
+//! Manifest to validated federation to plan to executors.

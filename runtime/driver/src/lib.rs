@@ -1,0 +1,1 @@
+//! Deterministic reactors, alone or federated: what a federate program depends on.

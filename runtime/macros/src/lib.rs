@@ -1,0 +1,1 @@
+//! The attribute layer over the Ictus program builder.

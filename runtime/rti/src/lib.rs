@@ -1,0 +1,1 @@
+//! The RTI as a server: sockets around ictus-coord.

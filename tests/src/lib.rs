@@ -1,0 +1,1 @@
+//! End to end, interoperability, tidy. Imports everything, imported by nothing.
