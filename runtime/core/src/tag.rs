@@ -41,11 +41,20 @@ impl Delay {
 
 impl Tag {
     /// Before every tag: (-2^63, 0).
-    pub const NEVER: Self = Self { time: LogicalTime::NEVER, microstep: 0 };
+    pub const NEVER: Self = Self {
+        time: LogicalTime::NEVER,
+        microstep: 0,
+    };
     /// After every tag: (2^63-1, 2^32-1).
-    pub const FOREVER: Self = Self { time: LogicalTime::FOREVER, microstep: u32::MAX };
+    pub const FOREVER: Self = Self {
+        time: LogicalTime::FOREVER,
+        microstep: u32::MAX,
+    };
     /// (0, 0): the neutral path delay.
-    pub const ZERO: Self = Self { time: LogicalTime::from_nanos(0), microstep: 0 };
+    pub const ZERO: Self = Self {
+        time: LogicalTime::from_nanos(0),
+        microstep: 0,
+    };
 
     /// The tag (`time`, `microstep`).
     #[must_use]
@@ -72,7 +81,10 @@ impl Tag {
         match delay {
             Delay::None => self,
             Delay::Microstep => match self.microstep.checked_add(1) {
-                Some(microstep) => Self { time: self.time, microstep },
+                Some(microstep) => Self {
+                    time: self.time,
+                    microstep,
+                },
                 None => Self::FOREVER,
             },
             Delay::Time(duration) => match self.time.saturating_add(duration) {
@@ -108,9 +120,19 @@ impl Tag {
             self
         } else if self.microstep == 0 {
             let time = LogicalTime::from_nanos(self.time.as_nanos() - 1);
-            if time.as_nanos() == i64::MIN { Self::NEVER } else { Self { time, microstep: u32::MAX } }
+            if time.as_nanos() == i64::MIN {
+                Self::NEVER
+            } else {
+                Self {
+                    time,
+                    microstep: u32::MAX,
+                }
+            }
         } else {
-            Self { time: self.time, microstep: self.microstep - 1 }
+            Self {
+                time: self.time,
+                microstep: self.microstep - 1,
+            }
         }
     }
 
@@ -138,9 +160,10 @@ impl Tag {
         }
         let microstep = if b > 0 { 0 } else { self.microstep };
         match (a.checked_add(b), microstep.checked_add(path.microstep)) {
-            (Some(time), Some(microstep)) if time != i64::MAX => {
-                Self { time: LogicalTime::from_nanos(time), microstep }
-            }
+            (Some(time), Some(microstep)) if time != i64::MAX => Self {
+                time: LogicalTime::from_nanos(time),
+                microstep,
+            },
             _ => Self::FOREVER,
         }
     }
@@ -226,9 +249,21 @@ mod tests {
     fn delays_of_the_wire_document() {
         let g = Tag::new(LogicalTime::from_nanos(7), 3);
         let table = [
-            (Delay::None, Tag::new(LogicalTime::from_nanos(7), 3), Tag::new(LogicalTime::from_nanos(7), 3)),
-            (Delay::Microstep, Tag::new(LogicalTime::from_nanos(7), 4), Tag::new(LogicalTime::from_nanos(7), 4)),
-            (Delay::Time(Duration::from_nanos(5)), Tag::at(12), Tag::new(LogicalTime::from_nanos(11), u32::MAX)),
+            (
+                Delay::None,
+                Tag::new(LogicalTime::from_nanos(7), 3),
+                Tag::new(LogicalTime::from_nanos(7), 3),
+            ),
+            (
+                Delay::Microstep,
+                Tag::new(LogicalTime::from_nanos(7), 4),
+                Tag::new(LogicalTime::from_nanos(7), 4),
+            ),
+            (
+                Delay::Time(Duration::from_nanos(5)),
+                Tag::at(12),
+                Tag::new(LogicalTime::from_nanos(11), u32::MAX),
+            ),
         ];
         for (delay, expected, strict) in table {
             assert_eq!(g.delayed(delay), expected);
