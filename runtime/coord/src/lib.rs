@@ -1,9 +1,12 @@
 //! Federated coordination as state machines: wire codec, RTI, federate. Pure.
 
 pub mod describe;
+#[doc(hidden)]
+pub mod mutants;
 mod payload;
 pub mod plan;
 pub mod report;
+pub mod topology;
 pub mod wire;
 
 pub use payload::{FederateExecutor, PayloadError};
