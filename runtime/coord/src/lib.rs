@@ -1,6 +1,7 @@
 //! Federated coordination as state machines: wire codec, RTI, federate. Pure.
 
 pub mod describe;
+pub mod federate;
 #[doc(hidden)]
 pub mod mutants;
 mod payload;

@@ -327,6 +327,27 @@ pub enum DecodeError {
     NeighborCount(i32),
 }
 
+/// Appends a TAGGED_MESSAGE whose payload is written in place: one copy, straight from the value.
+///
+/// # Panics
+///
+/// When the payload is longer than `u32::MAX` bytes.
+#[inline]
+pub fn encode_tagged_message(
+    port: u16,
+    federate: u16,
+    tag: Tag,
+    out: &mut Vec<u8>,
+    payload: impl FnOnce(&mut Vec<u8>),
+) {
+    let start = out.len();
+    ToRti::TaggedMessage(TaggedMessage { port, federate, tag, payload: &[] }).encode(out);
+    let body = out.len();
+    payload(out);
+    let length = u32::try_from(out.len() - body).expect("payloads are shorter than 4 GiB");
+    out[start + 5..start + 9].copy_from_slice(&length.to_le_bytes());
+}
+
 impl<'a> ToRti<'a> {
     /// Appends the message's bytes to `out`.
     ///

@@ -11,7 +11,7 @@
 
 use crate::graph::BitSet;
 use crate::id::{ActionId, InputId, NodeId, OutputId, SlotId, ValueId};
-use crate::program::{ActionKind, NodeKind, Program};
+use crate::program::{ActionKind, NetworkInput, NodeKind, Program};
 use crate::queue::EventQueue;
 use crate::tag::{Delay, Tag};
 use crate::time::{Duration, LogicalTime, PhysicalTime};
@@ -508,6 +508,14 @@ impl Timeline {
         }
     }
 
+    /// Drops what is blocked at the current tag: the status it waits for will never come.
+    pub fn abandon(&mut self) {
+        self.ready.clear();
+        self.busy.clear();
+        self.unknown.clear();
+        self.unknown_count = 0;
+    }
+
     /// Ends the current tag and says whether a network input was present at it.
     #[inline]
     pub fn complete(&mut self) -> bool {
@@ -531,8 +539,6 @@ impl Timeline {
             })
     }
 }
-
-use crate::program::NetworkInput;
 
 /// Triggered nodes by level.
 #[derive(Debug)]
@@ -561,6 +567,12 @@ impl ReadyLists {
 
     fn is_empty(&self) -> bool {
         self.count == 0
+    }
+
+    fn clear(&mut self) {
+        self.levels.iter_mut().for_each(Vec::clear);
+        self.marked.fill(false);
+        self.count = 0;
     }
 
     /// Adds a node once; says whether it was not there yet.

@@ -1,0 +1,497 @@
+//! A federate as a state machine: the timeline joined with centralized coordination. Bytes in, bytes out, no I/O.
+//!
+//! The driver's loop, whose order matters (*mutate, then poll to `Wait`, then flush, then wait*):
+//!
+//! ```text
+//! loop {
+//!     federate.receive(now, bytes, executor)            // whatever has arrived; also schedule_physical, request_stop
+//!     match federate.poll(now, executor) {
+//!         Run       => federate.run_batch(executor)      // or run its nodes one by one and `finish` each
+//!         Wait(at)  => { federate.flush(); write federate.output(); wait for bytes, an event or `at` }
+//!         Ended     => break
+//!     }
+//! }
+//! ```
+//!
+//! A federate without an RTI link is a program alone: the same loop, and nothing is ever asked.
+//!
+//! Source: sections 3, 5, 9 and 10 of the wire document; DESIGN section 4.
+
+mod join;
+mod link;
+mod stop;
+
+use crate::payload::{FederateExecutor, PayloadError};
+use crate::wire::{DecodeError, RejectReason};
+use ictus_core::{
+    ActionId, Admission, Delay, Duration, Effects, NodeId, NodeKind, OutputId, PhysicalTime,
+    Program, Progress, Tag, Timeline, ValueId,
+};
+use join::Phase;
+pub use link::{InputLink, LinkConfig, OutputLink};
+use link::{Link, Permission};
+use std::collections::VecDeque;
+use std::sync::Arc;
+use thiserror::Error;
+
+/// How a program runs.
+#[derive(Clone, Debug, Default)]
+pub struct FederateConfig {
+    /// The stop tag is this long after the start tag.
+    pub timeout: Option<Duration>,
+    /// Run ahead of physical time.
+    pub fast: bool,
+    /// Go on when no event is left.
+    pub keepalive: bool,
+}
+
+/// What the driver must do next.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub enum Poll {
+    /// Run the nodes of [`Federate::batch`].
+    Run,
+    /// Wait for bytes, a physical event, or this time; `None`: only bytes or an event can help.
+    Wait(Option<PhysicalTime>),
+    /// Nothing more will happen; [`Federate::outcome`] says why.
+    Ended,
+}
+
+/// What the driver may want to tell the world.
+#[derive(Clone, PartialEq, Eq, Debug)]
+pub enum FederateEvent {
+    /// The RTI accepted the join.
+    Joined,
+    /// The clock is off by this much: add it to every later reading.
+    ClockOffset(Duration),
+    /// The start tag is agreed.
+    Started(Tag),
+    /// The first tag is completed.
+    Running,
+    /// A stop was requested by this program or by another.
+    StopRequested,
+    /// The stop tag is agreed.
+    StopGranted(Tag),
+    /// Another federate was lost; the federation stops.
+    PeerLost(u16),
+}
+
+/// How a federate ended.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum Outcome {
+    /// The stop tag was completed: time-out, stop by request, or nothing left to do.
+    #[error("ended at its stop tag")]
+    Stopped,
+    /// The stop tag was completed after another federate had failed.
+    #[error("stopped because federate {0} was lost")]
+    PeerLost(u16),
+    /// The connection to the RTI ended before the federate did.
+    #[error("the RTI was lost")]
+    RtiLost,
+    /// The RTI said FAILED.
+    #[error("the RTI reported that the federation failed")]
+    RtiFailed,
+    /// The RTI refused the join.
+    #[error("the RTI refused the join: {0}")]
+    Rejected(RejectReason),
+    /// The RTI said something that is not of the protocol.
+    #[error("the RTI broke the protocol: {0}")]
+    Protocol(#[from] ProtocolError),
+    /// A message was not of its input's type.
+    #[error(transparent)]
+    Payload(#[from] PayloadError),
+    /// Tag arithmetic left its range.
+    #[error("a tag overflowed at {0}")]
+    Overflow(Tag),
+    /// The program itself failed; see the driver's fault.
+    #[error("the program failed")]
+    Fault,
+}
+
+/// What a peer may not do. Fatal for this federate.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum ProtocolError {
+    /// The bytes are no message.
+    #[error(transparent)]
+    Decode(#[from] DecodeError),
+    /// A message that does not belong here, by name.
+    #[error("unexpected {message} while {phase}")]
+    Unexpected {
+        /// The message.
+        message: &'static str,
+        /// What the federate was doing.
+        phase: &'static str,
+    },
+    /// A message for a port that this federate does not have.
+    #[error("message for unknown port {0}")]
+    UnknownPort(u16),
+    /// A message for another federate.
+    #[error("message for federate {0}")]
+    WrongFederate(u16),
+    /// Centralized coordination promises that this cannot happen.
+    #[error("message with tag {intended} for {input} arrived when the federate was at {current}")]
+    Tardy {
+        /// The message's tag.
+        intended: Tag,
+        /// Where the federate was.
+        current: Tag,
+        /// The input's path.
+        input: String,
+    },
+}
+
+/// Counters for status lines and metrics.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Counters {
+    /// Tags completed.
+    pub tags: u64,
+    /// Nodes run.
+    pub reactions: u64,
+    /// Messages sent to other federates.
+    pub sent: u64,
+    /// Messages received from other federates.
+    pub received: u64,
+    /// Provisional grants received.
+    pub provisional: u64,
+    /// Announcements (NET) that DNET made needless.
+    pub skipped_announcements: u64,
+}
+
+/// One federate: a timeline and, when it is not alone, its link to the RTI.
+#[derive(Debug)]
+pub struct Federate {
+    config: FederateConfig,
+    timeline: Timeline,
+    link: Option<Link>,
+    phase: Phase,
+    batch: Vec<NodeId>,
+    effects: Effects,
+    present: Vec<(ActionId, ValueId)>,
+    events: VecDeque<FederateEvent>,
+    outcome: Option<Outcome>,
+    counters: Counters,
+    physical_delay: Option<Duration>,
+    stop: stop::Stop,
+}
+
+impl Federate {
+    /// A program alone: it starts at the tag given to [`Federate::start`].
+    #[must_use]
+    pub fn alone(program: Arc<Program>, config: FederateConfig) -> Self {
+        Self::new(program, config, None)
+    }
+
+    /// A federate that will join over a connection: [`Federate::connect`] begins.
+    #[must_use]
+    pub fn federated(program: Arc<Program>, config: FederateConfig, link: LinkConfig) -> Self {
+        let senders = Timeline::new(Arc::clone(&program)).senders().collect();
+        Self::new(program, config, Some(Link::new(link, senders)))
+    }
+
+    fn new(program: Arc<Program>, config: FederateConfig, link: Option<Link>) -> Self {
+        Self {
+            physical_delay: program.least_physical_delay(),
+            timeline: Timeline::new(program),
+            config,
+            link,
+            phase: Phase::Idle,
+            batch: Vec::new(),
+            effects: Effects::default(),
+            present: Vec::new(),
+            events: VecDeque::new(),
+            outcome: None,
+            counters: Counters::default(),
+            stop: stop::Stop::default(),
+        }
+    }
+
+    /// The timeline, to look at.
+    #[must_use]
+    pub fn timeline(&self) -> &Timeline {
+        &self.timeline
+    }
+
+    /// The counters.
+    #[must_use]
+    pub fn counters(&self) -> Counters {
+        self.counters
+    }
+
+    /// The nodes to run after [`Poll::Run`].
+    #[must_use]
+    pub fn batch(&self) -> &[NodeId] {
+        &self.batch
+    }
+
+    /// How it ended, after [`Poll::Ended`].
+    #[must_use]
+    pub fn outcome(&self) -> Option<&Outcome> {
+        self.outcome.as_ref()
+    }
+
+    /// The next event, in order.
+    #[must_use]
+    pub fn poll_event(&mut self) -> Option<FederateEvent> {
+        self.events.pop_front()
+    }
+
+    /// Starts a program alone at `start`.
+    pub fn start(&mut self, start: Tag) {
+        let stop = self.config.timeout.map_or(Tag::FOREVER, |timeout| {
+            if timeout <= Duration::ZERO {
+                start
+            } else {
+                start.delayed(Delay::Time(timeout))
+            }
+        });
+        self.timeline.start(start, stop);
+        self.phase = Phase::Running;
+        self.events.push_back(FederateEvent::Started(start));
+    }
+
+    /// Ends at once: no further tag is entered, and others are told that this federate failed.
+    pub fn fail(&mut self) {
+        self.end_with(Outcome::Fault);
+    }
+
+    fn end_with(&mut self, outcome: Outcome) {
+        if self.outcome.is_none() {
+            if let Some(link) = &mut self.link {
+                link.fail();
+            }
+            self.outcome = Some(outcome);
+        }
+        self.phase = Phase::Ended;
+    }
+
+    /// Queues an event from outside, stamped by the physical clock, and returns its tag.
+    ///
+    /// The tag is never before what was announced to others, so that no promise is broken.
+    pub fn schedule_physical(
+        &mut self,
+        stamp: PhysicalTime,
+        action: ActionId,
+        value: ValueId,
+    ) -> Tag {
+        let floor = self.link.as_ref().map_or(Tag::NEVER, Link::announced);
+        self.timeline.schedule_physical(stamp, action, value, floor)
+    }
+
+    /// Decides what can be done at physical time `now`.
+    pub fn poll(&mut self, now: PhysicalTime, executor: &mut impl FederateExecutor) -> Poll {
+        match self.phase {
+            Phase::Running => self.poll_running(now, executor),
+            Phase::Ended => Poll::Ended,
+            Phase::Idle
+            | Phase::AwaitingAck
+            | Phase::Synchronizing(_)
+            | Phase::AwaitingStart
+            | Phase::Draining => Poll::Wait(None),
+        }
+    }
+
+    fn poll_running(&mut self, now: PhysicalTime, executor: &mut impl FederateExecutor) -> Poll {
+        loop {
+            if self.timeline.current().is_some() {
+                self.batch.clear();
+                match self.timeline.ready(&mut self.batch) {
+                    Progress::Batch => return Poll::Run,
+                    Progress::InFlight => return Poll::Wait(None),
+                    Progress::Blocked if self.stop.abandoned() => self.timeline.abandon(),
+                    Progress::Blocked => return Poll::Wait(None),
+                    Progress::TagDone => self.complete(),
+                }
+            } else if self.timeline.overflowed() {
+                self.end_with(Outcome::Overflow(self.timeline.at()));
+                return Poll::Ended;
+            } else if self.timeline.finished() {
+                return self.leave();
+            } else if let Err(poll) = self.enter_next(now, executor) {
+                return poll;
+            }
+        }
+    }
+
+    /// Enters the next tag, or says how long to wait.
+    #[inline]
+    fn enter_next(
+        &mut self,
+        now: PhysicalTime,
+        executor: &mut impl FederateExecutor,
+    ) -> Result<(), Poll> {
+        let Some(next) = self.next_tag() else {
+            return Err(Poll::Wait(None));
+        };
+        if self.stop.only_shutdown(next) {
+            self.timeline.begin_shutdown_only(&mut self.present);
+        } else {
+            let next = self.permit(now, next)?;
+            self.timeline.begin(next, &mut self.present);
+        }
+        executor.begin(self.timeline.at());
+        let program = Arc::clone(self.timeline.program());
+        for (action, value) in self.present.drain(..) {
+            executor.arrive(action, program.action_slot(action), value);
+        }
+        self.send_absents();
+        Ok(())
+    }
+
+    /// The next tag to execute, unless a stop in progress bars it.
+    #[inline]
+    fn next_tag(&mut self) -> Option<Tag> {
+        let mut next = self.timeline.next_tag();
+        if let Some(link) = &self.link {
+            next = next.min(link.provisional_tag(self.timeline.at()));
+        }
+        self.stop.allows(next).then_some(next)
+    }
+
+    /// Asks the clock and the link whether `next` may be entered; the answer may be a tag, because starving gives one.
+    #[inline]
+    fn permit(&mut self, now: PhysicalTime, next: Tag) -> Result<Tag, Poll> {
+        if let Some(link) = &mut self.link {
+            let promise = match self.physical_delay {
+                Some(delay) if !self.config.fast => now.saturating_add(delay),
+                Some(_) | None => PhysicalTime::FOREVER,
+            };
+            let permission = link.permit(now, next, promise);
+            if let Permission::Wait(until) = permission {
+                self.counters.skipped_announcements = link.skipped();
+                return Err(Poll::Wait(until));
+            }
+        }
+        if next == Tag::FOREVER {
+            return self.starve().ok_or(Poll::Wait(None));
+        }
+        let due = next.time.as_physical();
+        if !self.config.fast && now < due {
+            return Err(Poll::Wait(Some(due)));
+        }
+        Ok(next)
+    }
+
+    /// Nothing is left and nothing can come: the stop tag is the next microstep, unless told to keep alive.
+    fn starve(&mut self) -> Option<Tag> {
+        if self.config.keepalive || self.physical_delay.is_some() {
+            return None;
+        }
+        let stop = self.timeline.at().next_microstep()?;
+        self.timeline.stop_at(stop);
+        Some(self.timeline.stop_tag())
+    }
+
+    fn complete(&mut self) {
+        self.send_absents();
+        let network_inputs_ran = self.timeline.complete();
+        let tag = self.timeline.at();
+        if self.counters.tags == 0 {
+            self.events.push_back(FederateEvent::Running);
+        }
+        self.counters.tags += 1;
+        if let Some(link) = &mut self.link {
+            link.completed(tag, network_inputs_ran);
+        }
+    }
+
+    /// Runs the batch node by node and takes what it did.
+    #[inline]
+    pub fn run_batch(&mut self, executor: &mut impl FederateExecutor) {
+        let batch = std::mem::take(&mut self.batch);
+        let tag = self.timeline.at();
+        for node in &batch {
+            self.run_node(*node, tag, executor);
+        }
+        self.finish(&batch);
+        self.batch = batch;
+    }
+
+    /// Runs one node of the batch; its effects are taken by the next [`Federate::finish`].
+    #[inline]
+    pub fn run_node(&mut self, node: NodeId, tag: Tag, executor: &mut impl FederateExecutor) {
+        self.counters.reactions += 1;
+        match self.timeline.program().node(node) {
+            NodeKind::Send { output } => self.send(node, output, executor),
+            NodeKind::Reaction | NodeKind::Forward { .. } => {
+                executor.run(node, tag, &mut self.effects);
+            }
+        }
+    }
+
+    /// Takes the effects of nodes that are done.
+    #[inline]
+    pub fn finish(&mut self, nodes: &[NodeId]) {
+        self.timeline.finish(nodes, &mut self.effects);
+        if std::mem::take(&mut self.effects.stop) {
+            self.request_stop_at_current();
+        }
+        self.send_absents();
+    }
+
+    fn send(&mut self, node: NodeId, output: OutputId, executor: &mut impl FederateExecutor) {
+        let Some(link) = &mut self.link else { return };
+        if link.send(node, output, &self.timeline, |out| {
+            executor.encode(output, out)
+        }) {
+            self.counters.sent += 1;
+        }
+    }
+
+    /// In a zero-delay cycle: says of every output that cannot be set any more that it is absent.
+    #[inline]
+    fn send_absents(&mut self) {
+        if let Some(link) = &mut self.link
+            && link.in_cycle()
+        {
+            link.send_absents(&self.timeline);
+        }
+    }
+
+    /// Moves pending LTC and NET behind the messages they vouch for. Before every wait.
+    pub fn flush(&mut self) {
+        if let Some(link) = &mut self.link {
+            link.flush();
+        }
+    }
+
+    /// Bytes for the RTI, in order; the driver takes what it has written from the front. `None` for a program alone.
+    pub fn output(&mut self) -> Option<&mut Vec<u8>> {
+        self.link.as_mut().map(Link::output)
+    }
+
+    fn admit(
+        &mut self,
+        message: &Incoming<'_>,
+        executor: &mut impl FederateExecutor,
+    ) -> Result<(), Outcome> {
+        self.counters.received += 1;
+        let value = executor.decode(message.input, message.payload)?;
+        match self.timeline.admit(message.input, message.tag, value) {
+            Admission::Queued { .. } => Ok(()),
+            Admission::IntoCurrentTag => {
+                let program = self.timeline.program();
+                let action = program.network_inputs()[message.input.index()].action;
+                executor.arrive(action, program.action_slot(action), value);
+                Ok(())
+            }
+            Admission::Tardy { intended, .. } => {
+                let program = self.timeline.program();
+                let port = program.network_inputs()[message.input.index()].port;
+                let error = ProtocolError::Tardy {
+                    intended,
+                    current: self.timeline.at(),
+                    input: program.port_path(port),
+                };
+                Err(error.into())
+            }
+        }
+    }
+}
+
+/// A tagged message for one of our inputs.
+struct Incoming<'a> {
+    input: ictus_core::InputId,
+    tag: Tag,
+    payload: &'a [u8],
+}

@@ -1,0 +1,315 @@
+//! Joining, and what each message of the RTI means in each phase.
+
+use super::link::Link;
+use super::{Federate, FederateEvent, Incoming, Outcome, ProtocolError};
+use crate::payload::FederateExecutor;
+use crate::wire::{NO_CLOCK_SYNC, TaggedMessage, ToFederate, ToRti, capability};
+use ictus_core::{Duration, PhysicalTime, Tag};
+
+/// Round trips that scatter more than this say nothing: no correction is made. Source: section 4 of the wire document.
+const GUARD_BAND: Duration = Duration::from_micros(100);
+
+/// Where a federate is in its life.
+#[derive(Debug)]
+pub(super) enum Phase {
+    /// Made, not connected.
+    Idle,
+    /// FED_IDS sent.
+    AwaitingAck,
+    /// Comparing clocks.
+    Synchronizing(Exchanges),
+    /// Own time proposed.
+    AwaitingStart,
+    /// Executing tags.
+    Running,
+    /// Resigned; waiting for the RTI to close.
+    Draining,
+    /// Done.
+    Ended,
+}
+
+impl Phase {
+    fn name(&self) -> &'static str {
+        match self {
+            Self::Idle => "not connected",
+            Self::AwaitingAck => "waiting for the RTI to accept the join",
+            Self::Synchronizing(_) => "comparing clocks",
+            Self::AwaitingStart => "waiting for the start time",
+            Self::Running => "running",
+            Self::Draining => "leaving",
+            Self::Ended => "ended",
+        }
+    }
+}
+
+/// Clock exchanges over TCP: T1 from the RTI, T3 to it, T4 from it.
+#[derive(Debug)]
+pub(super) struct Exchanges {
+    wanted: u32,
+    sent_at: Option<(PhysicalTime, PhysicalTime)>,
+    errors: Vec<i64>,
+    round_trips: Vec<i64>,
+}
+
+impl Exchanges {
+    fn new(wanted: u32) -> Self {
+        Self {
+            wanted,
+            sent_at: None,
+            errors: Vec::new(),
+            round_trips: Vec::new(),
+        }
+    }
+
+    /// The mean error, or zero when the round trips scatter too much.
+    fn offset(&self) -> Duration {
+        let count = i64::try_from(self.errors.len()).unwrap_or(i64::MAX).max(1);
+        let mean = |values: &[i64]| values.iter().sum::<i64>() / count;
+        let mean_trip = mean(&self.round_trips);
+        let squares = self
+            .round_trips
+            .iter()
+            .map(|t| i128::from(t - mean_trip).pow(2));
+        let variance = squares.sum::<i128>() / i128::from(count);
+        if variance >= i128::from(GUARD_BAND.as_nanos()).pow(2) {
+            return Duration::ZERO;
+        }
+        Duration::from_nanos(mean(&self.errors))
+    }
+}
+
+impl Federate {
+    /// Begins to join: the first bytes for the RTI. A federate alone has nothing to say.
+    pub fn connect(&mut self) {
+        if let Some(link) = &mut self.link {
+            let federation = link.config.federation.clone();
+            link.say(&ToRti::FederateIds {
+                federate: link.config.id,
+                federation: federation.as_bytes(),
+            });
+            self.phase = Phase::AwaitingAck;
+        }
+    }
+
+    /// Takes what the RTI sent and returns how many bytes were whole messages; the driver keeps the rest.
+    pub fn receive(
+        &mut self,
+        now: PhysicalTime,
+        bytes: &[u8],
+        executor: &mut impl FederateExecutor,
+    ) -> usize {
+        let mut used = 0;
+        while !matches!(self.phase, Phase::Ended) {
+            let handled = match ToFederate::decode(&bytes[used..]) {
+                Ok(None) => break,
+                Ok(Some((message, length))) => {
+                    used += length;
+                    self.handle(now, &message, executor)
+                }
+                Err(error) => Err(ProtocolError::from(error).into()),
+            };
+            if let Err(outcome) = handled {
+                self.end_with(outcome);
+            }
+        }
+        used
+    }
+
+    fn handle(
+        &mut self,
+        now: PhysicalTime,
+        message: &ToFederate<'_>,
+        executor: &mut impl FederateExecutor,
+    ) -> Result<(), Outcome> {
+        match (&mut self.phase, message) {
+            (Phase::Draining | Phase::Ended, _) => Ok(()),
+            (_, ToFederate::Reject(reason)) => Err(Outcome::Rejected(*reason)),
+            (Phase::Running, _) => self.handle_running(now, message, executor),
+            (Phase::AwaitingAck, ToFederate::Ack) => {
+                self.introduce(now);
+                Ok(())
+            }
+            (Phase::Synchronizing(exchanges), ToFederate::ClockSyncT1(t1)) => {
+                exchanges.sent_at = Some((*t1, now));
+                if let Some(link) = &mut self.link {
+                    let federate = link.config.id;
+                    link.say(&ToRti::ClockSyncT3 { federate });
+                }
+                Ok(())
+            }
+            (Phase::Synchronizing(_), ToFederate::ClockSyncT4(t4)) => {
+                self.take_exchange(now, *t4);
+                Ok(())
+            }
+            (Phase::AwaitingStart, ToFederate::Timestamp(start)) => {
+                self.start(Tag::new(start.as_logical(), 0));
+                Ok(())
+            }
+            (_, ToFederate::Failed) => Err(Outcome::RtiFailed),
+            (phase, message) => Err(ProtocolError::Unexpected {
+                message: name(message),
+                phase: phase.name(),
+            }
+            .into()),
+        }
+    }
+
+    /// After the ACK: structure, clock port, what we can do; then clocks or the own time.
+    fn introduce(&mut self, now: PhysicalTime) {
+        let Some(link) = &mut self.link else { return };
+        self.events.push_back(FederateEvent::Joined);
+        link.say(&ToRti::NeighborStructure(link.neighbors()));
+        let exchanges = link.config.clock_exchanges;
+        link.say(&ToRti::UdpPort(if exchanges.is_some() {
+            0
+        } else {
+            NO_CLOCK_SYNC
+        }));
+        if link.config.extensions {
+            link.say(&ToRti::Capabilities(
+                capability::FLOW_CONTROL | capability::FEDERATE_LOST,
+            ));
+        }
+        match exchanges {
+            Some(wanted) if wanted > 0 => {
+                self.phase = Phase::Synchronizing(Exchanges::new(wanted));
+            }
+            Some(_) | None => {
+                link.say(&ToRti::Timestamp(now));
+                self.phase = Phase::AwaitingStart;
+            }
+        }
+    }
+
+    fn take_exchange(&mut self, now: PhysicalTime, t4: PhysicalTime) {
+        let Phase::Synchronizing(exchanges) = &mut self.phase else {
+            return;
+        };
+        let Some((t1, t2)) = exchanges.sent_at.take() else {
+            return;
+        };
+        // T3 is written in the same call that takes T1, so t3 = t2 and nothing is subtracted from the round trip.
+        let round_trip = t4.since(t1).as_nanos();
+        exchanges
+            .errors
+            .push((round_trip / 2).saturating_sub(t2.since(t1).as_nanos()));
+        exchanges.round_trips.push(round_trip);
+        if exchanges.errors.len() < exchanges.wanted as usize {
+            return;
+        }
+        let offset = exchanges.offset();
+        self.events.push_back(FederateEvent::ClockOffset(offset));
+        self.phase = Phase::AwaitingStart;
+        if let Some(link) = &mut self.link {
+            link.say(&ToRti::Timestamp(now.saturating_add(offset)));
+        }
+    }
+
+    fn handle_running(
+        &mut self,
+        now: PhysicalTime,
+        message: &ToFederate<'_>,
+        executor: &mut impl FederateExecutor,
+    ) -> Result<(), Outcome> {
+        let Some(link) = &mut self.link else {
+            return Ok(());
+        };
+        match message {
+            ToFederate::TaggedMessage(message) => self.take_message(message, executor)?,
+            ToFederate::PortAbsent(absent) => {
+                let input = link
+                    .input(absent.port)
+                    .ok_or(ProtocolError::UnknownPort(absent.port))?;
+                self.timeline.settle(input, absent.tag);
+            }
+            ToFederate::TagAdvanceGrant(tag) => link.grant(*tag, &mut self.timeline),
+            ToFederate::ProvisionalTagAdvanceGrant(tag) => {
+                self.counters.provisional += 1;
+                link.grant_provisionally(*tag, &mut self.timeline);
+            }
+            ToFederate::DownstreamNextEventTag(tag) => link.announcements_not_needed(*tag),
+            ToFederate::DownstreamConfirmed(tag) => link.downstream_confirmed(*tag),
+            ToFederate::StopRequest(tag) => self.answer_stop_request(*tag),
+            ToFederate::StopGranted(tag) => self.take_stop_tag(*tag),
+            ToFederate::FederateLost { federate, promise } => self.peer_lost(*federate, *promise),
+            ToFederate::Failed => self.abandon(Outcome::RtiFailed),
+            ToFederate::Ack
+            | ToFederate::Reject(_)
+            | ToFederate::Timestamp(_)
+            | ToFederate::ClockSyncT1(_)
+            | ToFederate::ClockSyncT4(_)
+            | ToFederate::AddressQueryReply { .. }
+            | ToFederate::RtiResponse { .. } => {
+                let phase = "running";
+                return Err(ProtocolError::Unexpected {
+                    message: name(message),
+                    phase,
+                }
+                .into());
+            }
+        }
+        let _ = now;
+        Ok(())
+    }
+
+    #[inline]
+    fn take_message(
+        &mut self,
+        message: &TaggedMessage<'_>,
+        executor: &mut impl FederateExecutor,
+    ) -> Result<(), Outcome> {
+        let Some(link) = &self.link else {
+            return Ok(());
+        };
+        if message.federate != link.config.id {
+            return Err(ProtocolError::WrongFederate(message.federate).into());
+        }
+        let input = link
+            .input(message.port)
+            .ok_or(ProtocolError::UnknownPort(message.port))?;
+        self.admit(
+            &Incoming {
+                input,
+                tag: message.tag,
+                payload: message.payload,
+            },
+            executor,
+        )
+    }
+
+    /// The connection ended. Expected after RESIGN; before the start it ends the federate at once; while running the
+    /// current tag is finished and shutdown reactions run.
+    pub fn handle_disconnect(&mut self) {
+        match self.phase {
+            Phase::Draining => self.phase = Phase::Ended,
+            Phase::Running => self.abandon(Outcome::RtiLost),
+            Phase::Ended => {}
+            Phase::Idle | Phase::AwaitingAck | Phase::Synchronizing(_) | Phase::AwaitingStart => {
+                self.link.as_mut().map(Link::output).map(Vec::clear);
+                self.end_with(Outcome::RtiLost);
+            }
+        }
+    }
+}
+
+fn name(message: &ToFederate<'_>) -> &'static str {
+    match message {
+        ToFederate::Ack => "ACK",
+        ToFederate::Reject(_) => "REJECT",
+        ToFederate::Timestamp(_) => "TIMESTAMP",
+        ToFederate::TaggedMessage(_) => "TAGGED_MESSAGE",
+        ToFederate::PortAbsent(_) => "PORT_ABSENT",
+        ToFederate::TagAdvanceGrant(_) => "TAG",
+        ToFederate::ProvisionalTagAdvanceGrant(_) => "PTAG",
+        ToFederate::DownstreamNextEventTag(_) => "DNET",
+        ToFederate::StopRequest(_) => "STOP_REQUEST",
+        ToFederate::StopGranted(_) => "STOP_GRANTED",
+        ToFederate::ClockSyncT1(_) => "T1",
+        ToFederate::ClockSyncT4(_) => "T4",
+        ToFederate::AddressQueryReply { .. } => "ADDRESS_QUERY_REPLY",
+        ToFederate::RtiResponse { .. } => "RTI_RESPONSE",
+        ToFederate::Failed => "FAILED",
+        ToFederate::DownstreamConfirmed(_) => "DOWNSTREAM_CONFIRMED",
+        ToFederate::FederateLost { .. } => "FEDERATE_LOST",
+    }
+}

@@ -1,0 +1,454 @@
+//! The link to the RTI under centralized coordination: what is announced (NET, LTC), granted (TAG, PTAG) and sent.
+
+use crate::plan::{ClockSync, ConnectionPlan, Plan};
+use crate::topology::{FederateId, Topology, connection_delay, zero_delay_cycle_inputs};
+use crate::wire::{self, NeighborStructure, PortAbsent, ToRti};
+use ictus_core::{
+    Delay, Duration, InputId, LogicalTime, NodeId, OutputId, PhysicalTime, Tag, Timeline,
+};
+use std::collections::VecDeque;
+
+/// How often a federate with physical actions renews its promise when it is not known what downstreams wait for.
+const ADVANCE_INTERVAL: Duration = Duration::from_millis(10);
+
+/// Clock exchanges while joining; both sides must count the same. Source: section 3.5 of the wire document.
+const CLOCK_EXCHANGES: u32 = 10;
+
+/// What a federate knows of its place in the federation.
+#[derive(Clone, Debug, Default)]
+pub struct LinkConfig {
+    /// The federate's id.
+    pub id: u16,
+    /// The federation id, at most 255 bytes.
+    pub federation: String,
+    /// Immediate upstreams with the least delay from each.
+    pub upstream: Vec<(u16, Delay)>,
+    /// Immediate downstreams.
+    pub downstream: Vec<u16>,
+    /// Per network input, in the order of [`InputId`].
+    pub inputs: Vec<InputLink>,
+    /// Per network output, in the order of [`OutputId`].
+    pub outputs: Vec<OutputLink>,
+    /// Whether this federate is on a cycle of connections without delay.
+    pub in_cycle: bool,
+    /// Whether the clock is compared with the RTI's while joining, and with how many exchanges.
+    pub clock_exchanges: Option<u32>,
+    /// Whether the RTI is ours.
+    pub extensions: bool,
+    /// How far a federate without upstreams may run ahead of what its downstreams have confirmed.
+    pub max_lead: Option<Duration>,
+    /// Whether the program runs ahead of physical time.
+    pub fast: bool,
+}
+
+impl LinkConfig {
+    /// The link of federate `id` of a plan; `inputs` and `outputs` are the indices into the plan's connections of its
+    /// network inputs and outputs, in the order of their ids. The federation id is the caller's to set.
+    ///
+    /// # Panics
+    ///
+    /// When an index is not of the plan.
+    #[must_use]
+    pub fn from_plan(plan: &Plan, id: u16, inputs: &[usize], outputs: &[usize]) -> Self {
+        let remote = |c: &&ConnectionPlan| c.from.federate != c.to.federate;
+        let topology = Topology::new(
+            plan.federates.len(),
+            plan.connections.iter().filter(remote).map(|c| {
+                (
+                    FederateId(c.from.federate),
+                    FederateId(c.to.federate),
+                    connection_delay(c),
+                )
+            }),
+        );
+        let me = FederateId(id);
+        let neighbors = topology.neighbor_structure(me);
+        let in_cycle = zero_delay_cycle_inputs(plan, &topology, me);
+        let input = |index: &usize| InputLink {
+            port_id: plan.connections[*index].port_id,
+            in_cycle: in_cycle.contains(index),
+        };
+        let output = |index: &usize| OutputLink {
+            federate: plan.connections[*index].to.federate,
+            port_id: plan.connections[*index].port_id,
+            delay: connection_delay(&plan.connections[*index]),
+        };
+        Self {
+            id,
+            federation: String::new(),
+            upstream: neighbors.upstream,
+            downstream: neighbors.downstream,
+            inputs: inputs.iter().map(input).collect(),
+            outputs: outputs.iter().map(output).collect(),
+            in_cycle: topology.in_zero_delay_cycle(me),
+            clock_exchanges: (plan.clock_sync == ClockSync::Init).then_some(CLOCK_EXCHANGES),
+            extensions: plan.extensions,
+            max_lead: plan.max_lead_ns.map(Duration::from_nanos),
+            fast: plan.fast,
+        }
+    }
+}
+
+/// A network input on the wire.
+#[derive(Clone, Copy, Debug)]
+pub struct InputLink {
+    /// The port id that senders use.
+    pub port_id: u16,
+    /// Whether it comes without delay from a member of this federate's zero-delay cycle: a provisional grant leaves
+    /// its status unknown.
+    pub in_cycle: bool,
+}
+
+/// A network output on the wire.
+#[derive(Clone, Copy, Debug)]
+pub struct OutputLink {
+    /// The receiving federate.
+    pub federate: u16,
+    /// The receiver's port id.
+    pub port_id: u16,
+    /// The connection's delay.
+    pub delay: Delay,
+}
+
+/// Whether a tag may be entered as far as the RTI is concerned.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub(super) enum Permission {
+    Enter,
+    Wait(Option<PhysicalTime>),
+}
+
+#[derive(Debug)]
+pub(super) struct Link {
+    pub(super) config: LinkConfig,
+    out: Vec<u8>,
+    granted: Tag,
+    provisional: Option<Tag>,
+    /// The last announced tag (NET), sent or pending.
+    announced: Tag,
+    skipped: Option<Tag>,
+    skipped_count: u64,
+    not_needed_through: Option<Tag>,
+    pending_announcement: Option<Tag>,
+    pending_confirmation: Option<Tag>,
+    last_confirmed: Tag,
+    /// Per sender node: the tag at which its output was last sent or said to be absent.
+    told_at: Vec<Tag>,
+    senders: Vec<(NodeId, OutputId)>,
+    unconfirmed: VecDeque<Sent>,
+}
+
+/// A run of tags at which messages were sent that no downstream has confirmed.
+#[derive(Debug)]
+struct Sent {
+    first: Tag,
+    last: Tag,
+}
+
+impl Link {
+    pub(super) fn new(config: LinkConfig, senders: Vec<(NodeId, OutputId)>) -> Self {
+        let nodes = senders
+            .iter()
+            .map(|(node, _)| node.index() + 1)
+            .max()
+            .unwrap_or(0);
+        Self {
+            out: Vec::new(),
+            granted: Tag::NEVER,
+            provisional: None,
+            announced: Tag::NEVER,
+            skipped: None,
+            skipped_count: 0,
+            not_needed_through: None,
+            pending_announcement: None,
+            pending_confirmation: None,
+            last_confirmed: Tag::NEVER,
+            told_at: vec![Tag::NEVER; nodes],
+            senders,
+            unconfirmed: VecDeque::new(),
+            config,
+        }
+    }
+
+    pub(super) fn output(&mut self) -> &mut Vec<u8> {
+        &mut self.out
+    }
+
+    pub(super) fn in_cycle(&self) -> bool {
+        self.config.in_cycle
+    }
+
+    pub(super) fn skipped(&self) -> u64 {
+        self.skipped_count
+    }
+
+    /// What was promised to downstreams: no event from outside may get an earlier tag.
+    pub(super) fn announced(&self) -> Tag {
+        if self.config.downstream.is_empty() {
+            return Tag::NEVER;
+        }
+        self.announced.max(self.skipped.unwrap_or(Tag::NEVER))
+    }
+
+    /// The tag of a provisional grant that is still to be executed, FOREVER when there is none.
+    pub(super) fn provisional_tag(&self, at: Tag) -> Tag {
+        self.provisional
+            .filter(|tag| *tag > at)
+            .unwrap_or(Tag::FOREVER)
+    }
+
+    pub(super) fn neighbors(&self) -> NeighborStructure {
+        NeighborStructure {
+            upstream: self.config.upstream.clone(),
+            downstream: self.config.downstream.clone(),
+        }
+    }
+
+    pub(super) fn input(&self, port_id: u16) -> Option<InputId> {
+        // Port ids are dense in practice: the id is the index.
+        let guess = usize::from(port_id);
+        let index = match self.config.inputs.get(guess) {
+            Some(input) if input.port_id == port_id => guess,
+            Some(_) | None => self
+                .config
+                .inputs
+                .iter()
+                .position(|i| i.port_id == port_id)?,
+        };
+        Some(InputId::new(index))
+    }
+
+    /// Whether `next` may be entered; announces it first, because others may wait for that.
+    ///
+    /// `promise` is the earliest time at which an event from outside may still happen (FOREVER: never): nothing later
+    /// is announced. Source: section 5 of the wire document; the interval is replaced by the time a downstream waits
+    /// for, when DNET says it.
+    #[inline]
+    pub(super) fn permit(
+        &mut self,
+        now: PhysicalTime,
+        next: Tag,
+        promise: PhysicalTime,
+    ) -> Permission {
+        if self.config.upstream.is_empty() && self.config.downstream.is_empty() {
+            return Permission::Enter;
+        }
+        if !self.config.downstream.is_empty() && promise < next.time.as_physical() {
+            return self.promise(now, next, promise);
+        }
+        self.announce(next);
+        if !self.config.upstream.is_empty() && self.granted < next {
+            return Permission::Wait(None);
+        }
+        if self.too_far_ahead(next) {
+            Permission::Wait(None)
+        } else {
+            Permission::Enter
+        }
+    }
+
+    fn promise(&mut self, now: PhysicalTime, next: Tag, promise: PhysicalTime) -> Permission {
+        self.announce(Tag::new(promise.as_logical(), 0));
+        let delay = promise.since(now);
+        let renew = match self.not_needed_through {
+            Some(Tag::FOREVER) => None,
+            Some(through) if through.time.as_physical() >= promise => Some(
+                through
+                    .time
+                    .as_physical()
+                    .saturating_add(Duration::NANOSECOND - delay),
+            ),
+            Some(_) | None => Some(now.saturating_add(ADVANCE_INTERVAL)),
+        };
+        let due = (next.time != LogicalTime::FOREVER)
+            .then(|| next.time.as_physical().saturating_add(-delay));
+        Permission::Wait([renew, due].into_iter().flatten().min())
+    }
+
+    #[inline]
+    fn announce(&mut self, next: Tag) {
+        if next == self.announced {
+            return;
+        }
+        let needed = self.not_needed_through.is_none_or(|through| through < next)
+            || (!self.config.upstream.is_empty() && self.granted < next);
+        if needed {
+            self.announced = next;
+            self.pending_announcement = Some(next);
+            self.skipped = None;
+        } else if self.skipped != Some(next) {
+            self.skipped = Some(next);
+            self.skipped_count += 1;
+        }
+    }
+
+    /// Takes a DNET: announcements up to `through` are needless; one that was skipped after it is made good.
+    pub(super) fn announcements_not_needed(&mut self, through: Tag) {
+        self.not_needed_through = Some(through);
+        if let Some(skipped) = self.skipped
+            && through < skipped
+        {
+            self.skipped = None;
+            self.announced = skipped;
+            self.pending_announcement = Some(skipped);
+        }
+    }
+
+    /// Takes a TAG. A grant that goes back is ignored.
+    pub(super) fn grant(&mut self, tag: Tag, timeline: &mut Timeline) {
+        if tag < self.granted {
+            return;
+        }
+        self.granted = tag;
+        self.provisional = None;
+        timeline.settle_all(tag);
+    }
+
+    /// Takes a PTAG: `tag` may be entered, but what comes over the cycle is unknown at it.
+    pub(super) fn grant_provisionally(&mut self, tag: Tag, timeline: &mut Timeline) {
+        if tag < self.granted || (tag == self.granted && self.provisional.is_none()) {
+            return;
+        }
+        self.granted = tag;
+        self.provisional = Some(tag);
+        for (index, input) in self.config.inputs.iter().enumerate() {
+            let through = if input.in_cycle {
+                tag.latest_earlier()
+            } else {
+                tag
+            };
+            timeline.settle(InputId::new(index), through);
+        }
+        if timeline.current().is_none() && timeline.at() >= tag {
+            self.confirm(tag);
+        }
+    }
+
+    /// Ends a tag: downstreams may count on it when a network input was handled or the cycle waits for it.
+    #[inline]
+    pub(super) fn completed(&mut self, tag: Tag, network_inputs_ran: bool) {
+        if network_inputs_ran || self.config.in_cycle {
+            self.confirm(tag);
+        }
+    }
+
+    fn confirm(&mut self, tag: Tag) {
+        if tag > self.last_confirmed {
+            self.last_confirmed = tag;
+            self.pending_confirmation = Some(tag);
+        }
+    }
+
+    /// Sends the value of `output`; says whether it was sent (not after the stop tag, nor past the end of time).
+    #[inline]
+    pub(super) fn send(
+        &mut self,
+        node: NodeId,
+        output: OutputId,
+        timeline: &Timeline,
+        payload: impl FnOnce(&mut Vec<u8>),
+    ) -> bool {
+        let at = timeline.at();
+        self.told_at[node.index()] = at;
+        let link = self.config.outputs[output.index()];
+        let tag = at.delayed(link.delay);
+        if tag > timeline.stop_tag() || tag == Tag::FOREVER {
+            return false;
+        }
+        wire::encode_tagged_message(link.port_id, link.federate, tag, &mut self.out, payload);
+        if let Some(through) = &mut self.not_needed_through {
+            *through = (*through).min(tag);
+        }
+        if self.flow_controlled() {
+            let grain = self.grain();
+            match self.unconfirmed.back_mut() {
+                Some(run) if at.time < run.first.time + grain => {
+                    run.last = at;
+                }
+                Some(_) | None => self.unconfirmed.push_back(Sent {
+                    first: at,
+                    last: at,
+                }),
+            }
+        }
+        true
+    }
+
+    /// Unconfirmed tags closer than this are counted as one run.
+    fn grain(&self) -> Duration {
+        let lead = self.config.max_lead.map_or(i64::MAX, Duration::as_nanos);
+        Duration::from_nanos(lead / 8)
+    }
+
+    fn flow_controlled(&self) -> bool {
+        self.config.extensions
+            && self.config.max_lead.is_some()
+            && (self.config.upstream.is_empty() || self.config.fast)
+    }
+
+    #[inline]
+    fn too_far_ahead(&self, next: Tag) -> bool {
+        match (self.unconfirmed.front(), self.config.max_lead) {
+            (Some(oldest), Some(lead)) => next.time > oldest.first.time + lead,
+            (Some(_) | None, _) => false,
+        }
+    }
+
+    /// Takes DOWNSTREAM_CONFIRMED: every message sent up to `through` was handled.
+    pub(super) fn downstream_confirmed(&mut self, through: Tag) {
+        while let Some(run) = self.unconfirmed.front_mut() {
+            if run.last <= through {
+                self.unconfirmed.pop_front();
+            } else {
+                run.first = run.first.max(through);
+                break;
+            }
+        }
+    }
+
+    /// PORT_ABSENT for every output that can no longer be set at the current tag.
+    pub(super) fn send_absents(&mut self, timeline: &Timeline) {
+        let Some(at) = timeline.current() else { return };
+        for (node, output) in &self.senders {
+            let told = &mut self.told_at[node.index()];
+            if *told != at && timeline.settled_without(*node) {
+                *told = at;
+                let link = self.config.outputs[output.index()];
+                let tag = at.delayed_strict(link.delay);
+                let absent = PortAbsent {
+                    port: link.port_id,
+                    federate: link.federate,
+                    tag,
+                };
+                ToRti::PortAbsent(absent).encode(&mut self.out);
+            }
+        }
+    }
+
+    /// Appends a message that nothing can supersede.
+    pub(super) fn say(&mut self, message: &ToRti<'_>) {
+        message.encode(&mut self.out);
+    }
+
+    /// Moves pending LTC and NET behind the messages they vouch for.
+    pub(super) fn flush(&mut self) {
+        if let Some(tag) = self.pending_confirmation.take() {
+            ToRti::LatestTagConfirmed(tag).encode(&mut self.out);
+        }
+        if let Some(tag) = self.pending_announcement.take() {
+            ToRti::NextEventTag(tag).encode(&mut self.out);
+        }
+    }
+
+    /// The last words at the stop tag.
+    pub(super) fn resign(&mut self) {
+        self.pending_announcement = Some(Tag::FOREVER);
+        self.flush();
+        ToRti::Resign.encode(&mut self.out);
+    }
+
+    /// The last word of a federate that cannot go on.
+    pub(super) fn fail(&mut self) {
+        self.pending_announcement = None;
+        ToRti::Failed.encode(&mut self.out);
+    }
+}

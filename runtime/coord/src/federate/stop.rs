@@ -1,0 +1,157 @@
+//! Stopping: consensus on a stop tag, the loss of a peer, the loss of the RTI.
+
+use super::join::Phase;
+use super::{Federate, FederateEvent, Outcome, Poll};
+use crate::wire::ToRti;
+use ictus_core::{PhysicalTime, Tag, Timeline};
+
+/// What a stop in progress allows.
+#[derive(Debug, Default)]
+pub(super) struct Stop {
+    consensus: Consensus,
+    /// The first tag at which a lost federate's silence could be mistaken for absence.
+    limit: Option<Tag>,
+    lost: Option<u16>,
+    abandoned: Option<Outcome>,
+}
+
+#[derive(Debug, Default, PartialEq)]
+enum Consensus {
+    #[default]
+    None,
+    /// We asked, or answered, with this tag: it and later ones are barred.
+    Barred(Tag),
+    Granted,
+}
+
+impl Stop {
+    /// Whether a tag may be entered, or must wait for the stop tag.
+    #[inline]
+    pub(super) fn allows(&self, next: Tag) -> bool {
+        if self.abandoned.is_some() {
+            return true;
+        }
+        match self.consensus {
+            Consensus::None => self.limit.is_none_or(|limit| next < limit),
+            Consensus::Barred(bar) => next < bar && self.limit.is_none_or(|limit| next < limit),
+            Consensus::Granted => true,
+        }
+    }
+
+    /// Whether nothing but shutdown may run any more.
+    #[inline]
+    pub(super) fn only_shutdown(&self, next: Tag) -> bool {
+        self.abandoned.is_some()
+            || (self.consensus == Consensus::Granted
+                && self.limit.is_some_and(|limit| next >= limit))
+    }
+
+    pub(super) fn abandoned(&self) -> bool {
+        self.abandoned.is_some()
+    }
+}
+
+impl Federate {
+    /// Asks for an ordered stop from outside (a signal): at the clock's time, or as soon as all can.
+    pub fn request_stop(&mut self, now: PhysicalTime) {
+        if !matches!(self.phase, Phase::Running) {
+            return;
+        }
+        let floor = after(&self.timeline);
+        let wanted = Tag::new(now.as_logical(), 0);
+        self.ask_for_stop(if self.config.fast {
+            floor
+        } else {
+            floor.max(wanted)
+        });
+    }
+
+    /// Asks for a stop on behalf of a reaction: one microstep after the current tag.
+    pub(super) fn request_stop_at_current(&mut self) {
+        self.ask_for_stop(after(&self.timeline));
+    }
+
+    fn ask_for_stop(&mut self, tag: Tag) {
+        if self.stop.consensus != Consensus::None {
+            return;
+        }
+        self.events.push_back(FederateEvent::StopRequested);
+        if let Some(link) = &mut self.link {
+            self.stop.consensus = Consensus::Barred(tag);
+            link.say(&ToRti::StopRequest(tag));
+        } else {
+            self.stop.consensus = Consensus::Granted;
+            self.timeline.stop_at(tag);
+            self.events
+                .push_back(FederateEvent::StopGranted(self.timeline.stop_tag()));
+        }
+    }
+
+    /// Answers STOP_REQUEST with the earliest tag at which this federate can stop, unless it asked itself.
+    pub(super) fn answer_stop_request(&mut self, tag: Tag) {
+        if self.stop.consensus != Consensus::None {
+            return;
+        }
+        let tag = tag.max(after(&self.timeline));
+        self.stop.consensus = Consensus::Barred(tag);
+        self.events.push_back(FederateEvent::StopRequested);
+        if let Some(link) = &mut self.link {
+            link.say(&ToRti::StopRequestReply(tag));
+        }
+    }
+
+    pub(super) fn take_stop_tag(&mut self, tag: Tag) {
+        self.timeline.stop_at(tag);
+        self.stop.consensus = Consensus::Granted;
+        self.events
+            .push_back(FederateEvent::StopGranted(self.timeline.stop_tag()));
+    }
+
+    /// Takes FEDERATE_LOST: from `limit` on, an absence could be a lie.
+    pub(super) fn peer_lost(&mut self, federate: u16, limit: Tag) {
+        self.stop.limit = Some(self.stop.limit.map_or(limit, |earlier| earlier.min(limit)));
+        if self.stop.lost.is_none() {
+            self.stop.lost = Some(federate);
+            self.events.push_back(FederateEvent::PeerLost(federate));
+        }
+    }
+
+    /// No grant will come any more: the current tag is finished as far as its inputs are known, then shutdown.
+    pub(super) fn abandon(&mut self, outcome: Outcome) {
+        if self.stop.abandoned.is_none() {
+            self.stop.abandoned = Some(outcome);
+            let next = after(&self.timeline);
+            self.timeline.stop_at(next);
+        }
+    }
+
+    /// The stop tag is completed: the last words, and the outcome.
+    pub(super) fn leave(&mut self) -> Poll {
+        let abandoned = self.stop.abandoned.take();
+        let lost = self.stop.lost;
+        let stays = abandoned.is_none();
+        let reached = lost.map_or(Outcome::Stopped, Outcome::PeerLost);
+        self.outcome = Some(abandoned.unwrap_or(reached));
+        match &mut self.link {
+            Some(link) if stays => {
+                link.resign();
+                self.phase = Phase::Draining;
+                Poll::Wait(None)
+            }
+            Some(_) | None => {
+                self.phase = Phase::Ended;
+                Poll::Ended
+            }
+        }
+    }
+
+    /// Whether everything is said: the driver half-closes and reads to the end.
+    #[must_use]
+    pub fn resigned(&self) -> bool {
+        matches!(self.phase, Phase::Draining)
+    }
+}
+
+fn after(timeline: &Timeline) -> Tag {
+    timeline.at().next_microstep().unwrap_or(Tag::FOREVER)
+}
