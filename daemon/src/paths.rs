@@ -1,0 +1,227 @@
+//! Where the daemon keeps things: state (records, logs) and run files (sockets, lock).
+
+use std::ffi::OsString;
+use std::fs::{self, DirBuilder, Permissions};
+use std::io;
+use std::os::unix::ffi::OsStrExt;
+use std::os::unix::fs::{DirBuilderExt, MetadataExt, PermissionsExt};
+use std::path::{Path, PathBuf};
+
+/// The longest socket path the kernel takes: `sun_path` has 108 bytes, the last one a zero.
+const SOCKET_PATH_BYTES_MAX: usize = 107;
+/// The longest name of a socket in the run directory: `/`, 32 hexadecimal digits, `.sock`.
+const SOCKET_NAME_BYTES_MAX: usize = 38;
+
+/// The two directories of one user's daemon.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Paths {
+    /// Records and logs; survives reboots.
+    pub state: PathBuf,
+    /// Sockets and the lock; private (mode 0700).
+    pub run: PathBuf,
+}
+
+/// Why the daemon has no place.
+#[derive(Debug, thiserror::Error)]
+pub enum PathsError {
+    /// None of the variables that say where is set. Set `HOME`.
+    #[error("neither ICTUS_STATE_DIR, XDG_STATE_HOME nor HOME is set")]
+    NoHome,
+    /// A variable names a relative directory. Give an absolute one.
+    #[error("{path} is not an absolute path", path = path.display())]
+    Relative {
+        /// The directory.
+        path: PathBuf,
+    },
+    /// Socket paths in this directory would be longer than the kernel takes. Set a shorter one.
+    #[error(
+        "{path} is too long for sockets: {bytes} bytes, and the kernel takes {SOCKET_PATH_BYTES_MAX}",
+        path = path.display()
+    )]
+    TooLong {
+        /// The run directory.
+        path: PathBuf,
+        /// The length of the longest socket path in it.
+        bytes: usize,
+    },
+    /// The run directory belongs to somebody else, who could answer in our name.
+    #[error("{path} belongs to uid {uid}, not to this user", path = path.display())]
+    NotOurs {
+        /// The run directory.
+        path: PathBuf,
+        /// Its owner.
+        uid: u32,
+    },
+    /// The directory cannot be made or read.
+    #[error("cannot prepare {path}", path = path.display())]
+    Unusable {
+        /// The directory.
+        path: PathBuf,
+        /// Why.
+        source: io::Error,
+    },
+}
+
+impl Paths {
+    /// Takes the directories from `ICTUS_STATE_DIR`, `XDG_STATE_HOME`, `XDG_RUNTIME_DIR` and `HOME`.
+    ///
+    /// # Errors
+    /// See [`PathsError`].
+    pub fn from_env() -> Result<Self, PathsError> {
+        Self::from_variables(|name| std::env::var_os(name).filter(|value| !value.is_empty()))
+    }
+
+    /// The same from any source of variables.
+    ///
+    /// # Errors
+    /// See [`PathsError`].
+    pub fn from_variables(variable: impl Fn(&str) -> Option<OsString>) -> Result<Self, PathsError> {
+        let paths = if let Some(state) = variable("ICTUS_STATE_DIR") {
+            let state = PathBuf::from(state);
+            Self {
+                run: state.join("run"),
+                state,
+            }
+        } else {
+            let home = variable("HOME").map(|home| PathBuf::from(home).join(".local/state"));
+            let home = variable("XDG_STATE_HOME").map(PathBuf::from).or(home);
+            let state = home.ok_or(PathsError::NoHome)?.join("ictus");
+            let run = variable("XDG_RUNTIME_DIR")
+                .map_or_else(|| state.join("run"), |run| PathBuf::from(run).join("ictus"));
+            Self { state, run }
+        };
+        paths.checked()
+    }
+
+    fn checked(self) -> Result<Self, PathsError> {
+        for path in [&self.state, &self.run] {
+            if !path.is_absolute() {
+                return Err(PathsError::Relative { path: path.clone() });
+            }
+        }
+        let bytes = self.run.as_os_str().as_bytes().len() + SOCKET_NAME_BYTES_MAX;
+        if bytes > SOCKET_PATH_BYTES_MAX {
+            return Err(PathsError::TooLong {
+                path: self.run,
+                bytes,
+            });
+        }
+        Ok(self)
+    }
+
+    /// Makes both directories; the run directory is private to this user.
+    ///
+    /// # Errors
+    /// When one cannot be made, or the run directory is somebody else's.
+    pub fn create(&self) -> Result<(), PathsError> {
+        let unusable = |path: &Path| {
+            let path = path.to_path_buf();
+            move |source| PathsError::Unusable { path, source }
+        };
+        let private = |path: &Path| {
+            DirBuilder::new()
+                .recursive(true)
+                .mode(0o700)
+                .create(path)
+                .map_err(unusable(path))
+        };
+        private(&self.state)?;
+        private(&self.run)?;
+        let found = fs::symlink_metadata(&self.run).map_err(unusable(&self.run))?;
+        if found.uid() != rustix::process::geteuid().as_raw() || !found.is_dir() {
+            return Err(PathsError::NotOurs {
+                path: self.run.clone(),
+                uid: found.uid(),
+            });
+        }
+        if found.mode() & 0o077 != 0 {
+            fs::set_permissions(&self.run, Permissions::from_mode(0o700))
+                .map_err(unusable(&self.run))?;
+        }
+        Ok(())
+    }
+
+    /// The daemon's socket.
+    #[must_use]
+    pub fn socket(&self) -> PathBuf {
+        self.run.join("ictusd.sock")
+    }
+
+    /// The daemon's lock: who holds it is the daemon.
+    #[must_use]
+    pub fn lock(&self) -> PathBuf {
+        self.run.join("ictusd.lock")
+    }
+
+    /// The socket of the supervisor with this instance id.
+    #[must_use]
+    pub fn supervisor_socket(&self, instance: &str) -> PathBuf {
+        self.run.join(format!("{instance}.sock"))
+    }
+
+    /// The on-demand daemon's own log.
+    #[must_use]
+    pub fn daemon_log(&self) -> PathBuf {
+        self.state.join("ictusd.log")
+    }
+
+    /// The directory of all federations.
+    #[must_use]
+    pub fn federations(&self) -> PathBuf {
+        self.state.join("federations")
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::ffi::OsString;
+
+    use super::{Paths, PathsError};
+
+    fn paths(variables: &[(&str, &str)]) -> Result<Paths, PathsError> {
+        Paths::from_variables(|name| {
+            variables
+                .iter()
+                .find(|(key, _)| *key == name)
+                .map(|(_, value)| OsString::from(value))
+        })
+    }
+
+    #[test]
+    fn the_runtime_directory_is_preferred_for_sockets() {
+        let found = paths(&[("HOME", "/home/a"), ("XDG_RUNTIME_DIR", "/run/user/7")]).unwrap();
+        assert_eq!(
+            found.socket().to_str(),
+            Some("/run/user/7/ictus/ictusd.sock")
+        );
+        assert_eq!(
+            found.federations().to_str(),
+            Some("/home/a/.local/state/ictus/federations")
+        );
+        let found = paths(&[("HOME", "/home/a")]).unwrap();
+        assert_eq!(
+            found.socket().to_str(),
+            Some("/home/a/.local/state/ictus/run/ictusd.sock")
+        );
+        let found = paths(&[
+            ("ICTUS_STATE_DIR", "/s"),
+            ("XDG_RUNTIME_DIR", "/run/user/7"),
+        ])
+        .unwrap();
+        assert_eq!(found.socket().to_str(), Some("/s/run/ictusd.sock"));
+    }
+
+    #[test]
+    fn bad_places_are_refused() {
+        assert!(matches!(paths(&[]), Err(PathsError::NoHome)));
+        assert!(matches!(
+            paths(&[("HOME", "x")]),
+            Err(PathsError::Relative { .. })
+        ));
+        let long = format!("/{}", "x".repeat(100));
+        assert!(matches!(
+            paths(&[("ICTUS_STATE_DIR", &long)]),
+            Err(PathsError::TooLong { bytes: 143, .. })
+        ));
+    }
+}
