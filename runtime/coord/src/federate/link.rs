@@ -55,13 +55,13 @@ impl LinkConfig {
             plan.federates.len(),
             plan.connections.iter().filter(remote).map(|c| {
                 (
-                    FederateId(c.from.federate),
-                    FederateId(c.to.federate),
+                    FederateId::new(c.from.federate),
+                    FederateId::new(c.to.federate),
                     connection_delay(c),
                 )
             }),
         );
-        let me = FederateId(id);
+        let me = FederateId::new(id);
         let neighbors = topology.neighbor_structure(me);
         let in_cycle = zero_delay_cycle_inputs(plan, &topology, me);
         let input = |index: &usize| InputLink {
