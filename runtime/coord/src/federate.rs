@@ -432,7 +432,7 @@ impl Federate {
     fn send(&mut self, node: NodeId, output: OutputId, executor: &mut impl FederateExecutor) {
         let Some(link) = &mut self.link else { return };
         if link.send(node, output, &self.timeline, |out| {
-            executor.encode(output, out)
+            executor.encode(output, out);
         }) {
             self.counters.sent += 1;
         }

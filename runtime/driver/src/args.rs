@@ -1,0 +1,123 @@
+//! The command line of a federate program.
+
+use std::path::PathBuf;
+use thiserror::Error;
+
+/// What the program is asked to do.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(crate) enum Command {
+    /// Describe the classes, or the instances requested in a file.
+    Describe(Option<PathBuf>),
+    /// Run federates of a plan.
+    Run(RunArgs),
+    /// Print the usage.
+    Help,
+}
+
+/// How to run.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub(crate) struct RunArgs {
+    pub(crate) plan: PathBuf,
+    pub(crate) federates: Vec<String>,
+    pub(crate) rti: Option<String>,
+    pub(crate) federation_id: Option<String>,
+    pub(crate) trace: Option<PathBuf>,
+    pub(crate) timing: Option<PathBuf>,
+    pub(crate) status_fd: Option<u32>,
+}
+
+/// Why a command line is refused.
+#[derive(Clone, Debug, PartialEq, Eq, Error)]
+pub(crate) enum ArgsError {
+    #[error("unknown option {0}")]
+    Unknown(String),
+    #[error("{0} needs a value")]
+    MissingValue(String),
+    #[error("--status-fd needs a descriptor number, not {0:?}")]
+    BadDescriptor(String),
+    #[error("nothing to do: give --plan FILE, or --describe")]
+    Nothing,
+}
+
+pub(crate) const USAGE: &str = "\
+usage: PROGRAM --plan PLAN.json [--federate NAME]... [--rti HOST:PORT] [-i ID]
+               [--trace DIR] [--timing DIR] [--status-fd N]
+       PROGRAM --describe [INSTANCES.json]
+
+Without --rti the whole plan runs in this process. With --rti each named federate joins the RTI as itself.
+Usually `ictus up FEDERATION.yaml` starts programs; by hand, `ictus check -o json` prints the plan.
+";
+
+pub(crate) fn parse(args: impl IntoIterator<Item = String>) -> Result<Command, ArgsError> {
+    let mut run = RunArgs::default();
+    let mut has_plan = false;
+    let mut args = args.into_iter();
+    while let Some(arg) = args.next() {
+        let mut value = || {
+            args.next()
+                .ok_or_else(|| ArgsError::MissingValue(arg.clone()))
+        };
+        match arg.as_str() {
+            "--describe" => return Ok(Command::Describe(args.next().map(PathBuf::from))),
+            "-h" | "--help" => return Ok(Command::Help),
+            "--plan" => {
+                run.plan = value()?.into();
+                has_plan = true;
+            }
+            "--federate" => run.federates.push(value()?),
+            "--rti" | "-r" => run.rti = Some(value()?),
+            "-i" | "--id" => run.federation_id = Some(value()?),
+            "--trace" => run.trace = Some(value()?.into()),
+            "--timing" => run.timing = Some(value()?.into()),
+            "--status-fd" => {
+                let text = value()?;
+                run.status_fd = Some(text.parse().map_err(|_| ArgsError::BadDescriptor(text))?);
+            }
+            _ => return Err(ArgsError::Unknown(arg)),
+        }
+    }
+    if has_plan {
+        Ok(Command::Run(run))
+    } else {
+        Err(ArgsError::Nothing)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn words(line: &str) -> Result<Command, ArgsError> {
+        parse(line.split_whitespace().map(str::to_owned))
+    }
+
+    #[test]
+    fn command_lines() {
+        assert_eq!(words("--describe"), Ok(Command::Describe(None)));
+        assert_eq!(
+            words("--describe f.json"),
+            Ok(Command::Describe(Some("f.json".into())))
+        );
+        assert_eq!(words(""), Err(ArgsError::Nothing));
+        assert_eq!(
+            words("--plan"),
+            Err(ArgsError::MissingValue("--plan".into()))
+        );
+        assert_eq!(words("--plna x"), Err(ArgsError::Unknown("--plna".into())));
+        let run = RunArgs {
+            plan: "p.json".into(),
+            federates: vec!["a".into(), "b".into()],
+            rti: Some("127.0.0.1:15045".into()),
+            federation_id: Some("x".into()),
+            status_fd: Some(3),
+            ..RunArgs::default()
+        };
+        let line =
+            "--plan p.json --federate a --federate b --rti 127.0.0.1:15045 -i x --status-fd 3";
+        assert_eq!(words(line), Ok(Command::Run(run)));
+        assert_eq!(
+            words("--plan p --status-fd x"),
+            Err(ArgsError::BadDescriptor("x".into()))
+        );
+    }
+}

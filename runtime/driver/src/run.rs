@@ -1,0 +1,553 @@
+//! Running: the loop around a [`Federate`], and the program's `main`.
+//!
+//! One thread per federate: it executes reactions, reads and writes its one socket, and waits in one place, so that
+//! nothing stands between a message and the reaction it triggers.
+
+use crate::args::{self, Command, RunArgs, USAGE};
+use crate::assembly::Assembly;
+use crate::bodies::{Bodies, Observation};
+use crate::class::Class;
+use crate::clock::{Clock, SystemClock};
+use crate::outside::OutsideEvent;
+use crate::status::Status;
+use crate::transport::{self, Connection, Signals, Waker};
+use ictus_coord::federate::{Federate, FederateConfig, FederateEvent, LinkConfig, Outcome, Poll};
+use ictus_coord::plan::Plan;
+use ictus_coord::report::{FederateStatus, exit};
+use ictus_core::{Duration, PhysicalTime, Tag};
+use std::io::{self, Write};
+use std::net::{SocketAddr, ToSocketAddrs};
+use std::process::ExitCode;
+use std::sync::Arc;
+
+mod error;
+
+pub use error::RunError;
+
+/// Written bytes leave at once beyond this many, although the federate is not about to wait.
+const FLUSH_BYTES: usize = 32 << 10;
+/// ... or when they are this old.
+const FLUSH_AGE: Duration = Duration::from_micros(200);
+/// More unwritten bytes than this and no further tag is begun until the socket has taken some.
+const BACKLOG_BYTES: usize = 4 << 20;
+/// A federate that never waits still looks at its socket after so many steps.
+const STEPS_PER_LOOK: u32 = 64;
+/// How long a connect is retried: the RTI may start after its federates.
+const CONNECT_FOR: Duration = Duration::from_secs(60);
+/// How long the RTI may take to close after RESIGN or FAILED.
+const DRAIN_FOR: Duration = Duration::from_secs(5);
+/// How often progress is reported.
+const PROGRESS_EVERY: Duration = Duration::from_secs(1);
+
+/// The `main` of a program that has these classes; [`program!`](crate::program) writes the call.
+#[must_use]
+pub fn main_with(classes: &[Class]) -> ExitCode {
+    let command = match args::parse(std::env::args().skip(1)) {
+        Ok(command) => command,
+        Err(error) => return complain(&format!("{error}\n{USAGE}"), exit::USAGE),
+    };
+    match command {
+        Command::Help => {
+            let written = io::stdout().write_all(USAGE.as_bytes());
+            if written.is_ok() {
+                ExitCode::SUCCESS
+            } else {
+                ExitCode::FAILURE
+            }
+        }
+        Command::Describe(file) => crate::describe::describe_main(classes, file.as_deref()),
+        Command::Run(run) => match run_plan(&run, classes) {
+            Ok(code) => ExitCode::from(code),
+            Err(error) => complain(&error.to_string(), error.exit_code()),
+        },
+    }
+}
+
+fn complain(message: &str, code: u8) -> ExitCode {
+    // Nobody reads standard error: the exit code still tells.
+    drop(writeln!(io::stderr(), "ictus: {message}"));
+    ExitCode::from(code)
+}
+
+fn run_plan(args: &RunArgs, classes: &[Class]) -> Result<u8, RunError> {
+    let text = std::fs::read(&args.plan).map_err(|source| RunError::ReadPlan {
+        path: args.plan.clone(),
+        source,
+    })?;
+    let plan: Plan = serde_json::from_slice(&text).map_err(|source| RunError::ParsePlan {
+        path: args.plan.clone(),
+        source,
+    })?;
+    let ids = named_federates(&plan, &args.federates)?;
+    match &args.rti {
+        None if ids.len() < plan.federates.len() => Err(RunError::NeedsRti),
+        None => Ok(run_one(
+            &Job {
+                plan: &plan,
+                args,
+                classes,
+                name: &plan.federation,
+            },
+            &ids,
+            None,
+        )?),
+        Some(rti) => {
+            let address = resolve(rti)?;
+            run_each(&plan, args, classes, &ids, address)
+        }
+    }
+}
+
+/// Every named federate on a thread of its own; the worst exit code wins.
+fn run_each(
+    plan: &Plan,
+    args: &RunArgs,
+    classes: &[Class],
+    ids: &[u16],
+    address: SocketAddr,
+) -> Result<u8, RunError> {
+    let run = |id: &u16| {
+        let name = &plan.federates[usize::from(*id)].name;
+        run_one(
+            &Job {
+                plan,
+                args,
+                classes,
+                name,
+            },
+            &[*id],
+            Some(address),
+        )
+    };
+    if let [id] = ids {
+        return run(id);
+    }
+    let results: Vec<Result<u8, RunError>> = std::thread::scope(|scope| {
+        let threads: Vec<_> = ids.iter().map(|id| scope.spawn(move || run(id))).collect();
+        threads
+            .into_iter()
+            .map(|thread| thread.join().unwrap_or(Ok(exit::FAILED)))
+            .collect()
+    });
+    let mut worst = exit::OK;
+    for result in results {
+        worst = worst.max(result?);
+    }
+    Ok(worst)
+}
+
+fn named_federates(plan: &Plan, names: &[String]) -> Result<Vec<u16>, RunError> {
+    let index = |name: &String| {
+        let found = plan.federates.iter().position(|f| f.name == *name);
+        let id = found.and_then(|index| u16::try_from(index).ok());
+        id.ok_or_else(|| RunError::UnknownFederate {
+            name: name.clone(),
+            known: plan.federates.iter().map(|f| f.name.clone()).collect(),
+        })
+    };
+    if names.is_empty() {
+        let count = u16::try_from(plan.federates.len()).unwrap_or(u16::MAX);
+        Ok((0..count).collect())
+    } else {
+        names.iter().map(index).collect()
+    }
+}
+
+fn resolve(rti: &str) -> Result<SocketAddr, RunError> {
+    let refused = || RunError::BadAddress {
+        address: rti.to_owned(),
+    };
+    // `user@host:port` is what LF's launcher passes.
+    let host = rti.rsplit('@').next().unwrap_or(rti);
+    let host = if host.contains(':') {
+        host.to_owned()
+    } else {
+        format!("{host}:15045")
+    };
+    let mut addresses = host.to_socket_addrs().map_err(|_| refused())?;
+    addresses.find(SocketAddr::is_ipv4).ok_or_else(refused)
+}
+
+/// What is to be run.
+struct Job<'a> {
+    plan: &'a Plan,
+    args: &'a RunArgs,
+    classes: &'a [Class],
+    name: &'a str,
+}
+
+fn run_one(job: &Job<'_>, ids: &[u16], rti: Option<SocketAddr>) -> Result<u8, RunError> {
+    let clock = Arc::new(SystemClock::new());
+    let mut assembly = Assembly::new(job.plan, ids, job.classes, clock.clone())?;
+    let observation = Observation {
+        trace: job.args.trace.clone(),
+        timing: job.args.timing.clone(),
+    };
+    assembly
+        .bodies
+        .observe(&observation)
+        .map_err(RunError::Observe)?;
+    let config = FederateConfig {
+        timeout: job.plan.timeout_ns.map(Duration::from_nanos),
+        fast: job.plan.fast,
+        keepalive: job.plan.keepalive,
+    };
+    let program = Arc::clone(&assembly.program);
+    let federate = match (rti, ids) {
+        (Some(_), [id]) => {
+            let mut link =
+                LinkConfig::from_plan(job.plan, *id, &assembly.inputs, &assembly.outputs);
+            link.federation = job
+                .args
+                .federation_id
+                .clone()
+                .unwrap_or_else(default_federation);
+            Federate::federated(program, config, link)
+        }
+        (Some(_) | None, _) => Federate::alone(program, config),
+    };
+    let connection = rti.map(connect).transpose()?;
+    let runner = Runner {
+        io: Io {
+            connection,
+            waker: Waker::new().map_err(RunError::Io)?,
+            signals: Signals::new().map_err(RunError::Io)?,
+        },
+        name: job.name,
+        plan: job.plan,
+        clock,
+        federate,
+        bodies: assembly.bodies,
+        status: Status::new(job.args.status_fd).map_err(RunError::Status)?,
+        start: Tag::NEVER,
+        outside: Vec::new(),
+        signals: 0,
+        written_at: PhysicalTime::NEVER,
+        reported_at: PhysicalTime::NEVER,
+    };
+    transport::precise_waits();
+    runner.run()
+}
+
+/// LF's default on both sides.
+fn default_federation() -> String {
+    "Unidentified Federation".to_owned()
+}
+
+fn connect(address: SocketAddr) -> Result<Connection, RunError> {
+    let clock = SystemClock::new();
+    let until = clock.now() + CONNECT_FOR;
+    loop {
+        match Connection::open(address, Duration::from_secs(5)) {
+            Ok(connection) => return Ok(connection),
+            Err(source) if clock.now() > until => {
+                return Err(RunError::Connect { address, source });
+            }
+            Err(_) => std::thread::sleep(std::time::Duration::from_millis(20)),
+        }
+    }
+}
+
+#[derive(Debug)]
+struct Io {
+    connection: Option<Connection>,
+    waker: Waker,
+    signals: Signals,
+}
+
+/// One federate with everything around it.
+struct Runner<'a> {
+    io: Io,
+    name: &'a str,
+    plan: &'a Plan,
+    clock: Arc<SystemClock>,
+    federate: Federate,
+    bodies: Bodies,
+    status: Status,
+    start: Tag,
+    outside: Vec<OutsideEvent>,
+    signals: usize,
+    written_at: PhysicalTime,
+    reported_at: PhysicalTime,
+}
+
+impl Runner<'_> {
+    fn run(mut self) -> Result<u8, RunError> {
+        let waker = self.io.waker.clone();
+        self.bodies
+            .outside()
+            .on_event(Arc::new(move || waker.wake()));
+        let mut now = self.clock.now();
+        self.federate.connect();
+        if self.io.connection.is_none() {
+            self.federate.start(Tag::new(now.as_logical(), 0));
+            self.events();
+        }
+        let looks_at_clock = !self.plan.fast;
+        let mut steps = 0;
+        loop {
+            steps += 1;
+            if looks_at_clock || steps % STEPS_PER_LOOK == 0 {
+                now = self.clock.now();
+            }
+            if steps % STEPS_PER_LOOK == 0 {
+                self.look(now);
+            }
+            match self.federate.poll(now, &mut self.bodies) {
+                Poll::Run => self.execute(now)?,
+                Poll::Wait(until) => {
+                    if self.federate.resigned() {
+                        break;
+                    }
+                    self.wait(now, until)?;
+                    now = self.clock.now();
+                    self.look(now);
+                }
+                Poll::Ended => break,
+            }
+        }
+        self.events();
+        self.leave()
+    }
+
+    #[inline]
+    fn execute(&mut self, now: PhysicalTime) -> Result<(), RunError> {
+        self.federate.run_batch(&mut self.bodies);
+        if self.bodies.fault().is_some() {
+            self.federate.fail();
+        }
+        let pending = self.federate.output().map_or(0, |out| out.len());
+        if pending > FLUSH_BYTES || (pending > 0 && now.since(self.written_at) > FLUSH_AGE) {
+            self.write(now);
+            while self
+                .federate
+                .output()
+                .is_some_and(|out| out.len() > BACKLOG_BYTES)
+            {
+                self.wait(now, None)?;
+                let now = self.clock.now();
+                self.look(now);
+                self.write(now);
+            }
+        }
+        Ok(())
+    }
+
+    /// Everything that came from outside: bytes, events, signals; then what the federate wants known.
+    fn look(&mut self, now: PhysicalTime) {
+        if let Some(connection) = &mut self.io.connection
+            && !connection.closed()
+        {
+            connection.read();
+            let used = self
+                .federate
+                .receive(now, connection.bytes(), &mut self.bodies);
+            connection.take(used);
+            if connection.closed() {
+                self.federate.handle_disconnect();
+            }
+        }
+        self.bodies.drain_outside(&mut self.outside);
+        for event in self.outside.drain(..) {
+            let tag = self
+                .federate
+                .schedule_physical(event.stamp, event.action, event.value);
+            self.bodies.note_physical(event.action, tag);
+        }
+        self.events();
+        self.report_progress(now);
+    }
+
+    fn wait(&mut self, now: PhysicalTime, until: Option<PhysicalTime>) -> Result<(), RunError> {
+        self.federate.flush();
+        self.write(now);
+        let wants_write = self.federate.output().is_some_and(|out| !out.is_empty());
+        let progress = self
+            .status
+            .enabled()
+            .then(|| self.reported_at + PROGRESS_EVERY);
+        let until = until.into_iter().chain(progress).min();
+        let timeout = until.map(|until| until.since(self.clock.now()));
+        let Io {
+            connection,
+            waker,
+            signals,
+        } = &mut self.io;
+        let woken = transport::wait(connection.as_ref(), wants_write, waker, signals, timeout)
+            .map_err(RunError::Io)?;
+        if woken.signal {
+            self.take_signals()?;
+        }
+        Ok(())
+    }
+
+    fn take_signals(&mut self) -> Result<(), RunError> {
+        for _ in 0..self.io.signals.take() {
+            self.signals += 1;
+            match self.signals {
+                1 if self.start != Tag::NEVER => self.federate.request_stop(self.clock.now()),
+                _ => return Err(RunError::Interrupted),
+            }
+        }
+        Ok(())
+    }
+
+    fn write(&mut self, now: PhysicalTime) {
+        self.written_at = now;
+        if let (Some(connection), Some(out)) = (&mut self.io.connection, self.federate.output())
+            && !out.is_empty()
+        {
+            connection.write(out);
+        }
+    }
+
+    fn events(&mut self) {
+        while let Some(event) = self.federate.poll_event() {
+            let federate = self.name.to_owned();
+            match event {
+                FederateEvent::Joined => self.status.say(&FederateStatus::Joined { federate }),
+                FederateEvent::ClockOffset(offset) => self.clock.correct(offset),
+                FederateEvent::Started(start) => {
+                    self.start = start;
+                    self.bodies.start(start);
+                    let start_ns = start.time.as_nanos();
+                    self.status
+                        .say(&FederateStatus::Start { federate, start_ns });
+                }
+                FederateEvent::Running => self.status.say(&FederateStatus::Running { federate }),
+                FederateEvent::StopGranted(tag) => self.bodies.note_stop(tag),
+                FederateEvent::StopRequested | FederateEvent::PeerLost(_) => {}
+            }
+        }
+    }
+
+    fn elapsed_ns(&self, tag: Tag) -> i64 {
+        tag.time.since(self.start.time).as_nanos()
+    }
+
+    fn report_progress(&mut self, now: PhysicalTime) {
+        if !self.status.enabled() || now.since(self.reported_at) < PROGRESS_EVERY {
+            return;
+        }
+        self.reported_at = now;
+        if self.start == Tag::NEVER {
+            return;
+        }
+        let (counters, bodies) = (self.federate.counters(), self.bodies.counters());
+        let at = self.federate.timeline().at();
+        self.status.say(&FederateStatus::Progress {
+            federate: self.name.to_owned(),
+            elapsed_ns: self.elapsed_ns(at),
+            microstep: at.microstep,
+            tags: counters.tags,
+            reactions: bodies.reactions,
+            sent: counters.sent,
+            received: counters.received,
+            deadlines_missed: bodies.deadlines_missed,
+        });
+    }
+
+    /// After the last tag: the last bytes, the trace's end, the last status line, the exit code.
+    fn leave(mut self) -> Result<u8, RunError> {
+        self.bodies.outside().close();
+        let at = self.federate.timeline().at();
+        let (code, reason) = self.verdict();
+        self.bodies
+            .note_end(at, &reason)
+            .map_err(RunError::Observe)?;
+        self.drain()?;
+        let started = self.start != Tag::NEVER;
+        self.status.say(&FederateStatus::Ended {
+            federate: self.name.to_owned(),
+            elapsed_ns: if started { self.elapsed_ns(at) } else { 0 },
+            microstep: at.microstep,
+            code,
+            reason: reason.clone(),
+        });
+        if code != exit::OK {
+            drop(writeln!(
+                io::stderr(),
+                "ictus: federate {}: {reason}",
+                self.name
+            ));
+        }
+        Ok(code)
+    }
+
+    /// Writes what is left, half-closes, and reads to the end: a socket closed with unread bytes would lose them.
+    fn drain(&mut self) -> Result<(), RunError> {
+        if self.io.connection.is_none() {
+            return Ok(());
+        }
+        let until = self.clock.now() + DRAIN_FOR;
+        let mut finished = false;
+        loop {
+            let now = self.clock.now();
+            self.write(now);
+            let empty = self.federate.output().is_none_or(|out| out.is_empty());
+            let Some(connection) = &mut self.io.connection else {
+                return Ok(());
+            };
+            if empty && !finished {
+                connection.finish();
+                finished = true;
+            }
+            connection.read();
+            let count = connection.bytes().len();
+            connection.take(count);
+            if connection.closed() || now > until {
+                return Ok(());
+            }
+            let Io {
+                connection,
+                waker,
+                signals,
+            } = &self.io;
+            transport::wait(
+                connection.as_ref(),
+                !empty,
+                waker,
+                signals,
+                Some(until.since(now)),
+            )
+            .map_err(RunError::Io)?;
+        }
+    }
+
+    fn verdict(&self) -> (u8, String) {
+        if let Some(fault) = self.bodies.fault() {
+            let elapsed = Duration::from_nanos(self.elapsed_ns(fault.tag));
+            let reason = format!(
+                "reaction {} of {} panicked at tag ({elapsed}, {}): {}",
+                fault.reaction, fault.path, fault.tag.microstep, fault.message
+            );
+            return (exit::FAILED, reason);
+        }
+        match self.federate.outcome() {
+            None | Some(Outcome::Stopped) => (exit::OK, Outcome::Stopped.to_string()),
+            Some(Outcome::PeerLost(id)) => {
+                let name = self
+                    .plan
+                    .federates
+                    .get(usize::from(*id))
+                    .map_or("?", |f| &f.name);
+                (
+                    exit::PEER_FAILED,
+                    format!("stopped because federate {name} was lost"),
+                )
+            }
+            Some(outcome @ Outcome::RtiLost) => {
+                let rti = self.rti_name();
+                (exit::RTI_LOST, format!("{outcome}{rti}"))
+            }
+            Some(outcome @ Outcome::RtiFailed) => (exit::PEER_FAILED, outcome.to_string()),
+            Some(outcome @ Outcome::Rejected(_)) => (exit::NOT_JOINED, outcome.to_string()),
+            Some(outcome) => (exit::FAILED, outcome.to_string()),
+        }
+    }
+
+    fn rti_name(&self) -> String {
+        let address = self.io.connection.as_ref().and_then(Connection::peer);
+        address.map_or_else(String::new, |address| format!(" ({address})"))
+    }
+}

@@ -1,0 +1,214 @@
+//! Bytes to and from the RTI, and the one place where a federate waits.
+
+use ictus_core::Duration;
+use rustix::event::{EventfdFlags, PollFd, PollFlags, Timespec, eventfd, poll};
+use rustix::io::Errno;
+use std::io::{self, ErrorKind, Read, Write};
+use std::net::{Shutdown, SocketAddr, TcpStream};
+use std::os::fd::{AsFd, OwnedFd};
+use std::os::unix::net::UnixStream;
+use std::sync::Arc;
+
+/// One read takes at most this much, so that a federate that lags sees a batch and not one message.
+const READ_BYTES: usize = 256 << 10;
+
+/// A non-blocking connection with a buffer of bytes that are not yet whole messages.
+#[derive(Debug)]
+pub(crate) struct Connection {
+    stream: TcpStream,
+    buffer: Vec<u8>,
+    filled: usize,
+    taken: usize,
+    closed: bool,
+}
+
+impl Connection {
+    /// Connects once, with Nagle off: what is written is already a batch.
+    pub(crate) fn open(address: SocketAddr, timeout: Duration) -> io::Result<Self> {
+        let stream = TcpStream::connect_timeout(&address, timeout.to_std())?;
+        stream.set_nodelay(true)?;
+        stream.set_nonblocking(true)?;
+        Ok(Self {
+            stream,
+            buffer: vec![0; READ_BYTES],
+            filled: 0,
+            taken: 0,
+            closed: false,
+        })
+    }
+
+    /// Reads what is there; after the end of the stream [`Connection::closed`] is true.
+    pub(crate) fn read(&mut self) {
+        if self.taken == self.filled {
+            (self.taken, self.filled) = (0, 0);
+        } else if self.taken > 0 && self.buffer.len() - self.filled < READ_BYTES / 2 {
+            self.buffer.copy_within(self.taken..self.filled, 0);
+            (self.taken, self.filled) = (0, self.filled - self.taken);
+        }
+        if self.filled == self.buffer.len() {
+            self.buffer.resize(self.buffer.len() * 2, 0);
+        }
+        match self.stream.read(&mut self.buffer[self.filled..]) {
+            Ok(0) => self.closed = true,
+            Ok(count) => self.filled += count,
+            Err(error)
+                if matches!(error.kind(), ErrorKind::WouldBlock | ErrorKind::Interrupted) => {}
+            // A reset ends the stream like a close, after what was received is processed.
+            Err(_) => self.closed = true,
+        }
+    }
+
+    /// The bytes received and not taken.
+    pub(crate) fn bytes(&self) -> &[u8] {
+        &self.buffer[self.taken..self.filled]
+    }
+
+    /// Marks bytes as processed.
+    pub(crate) fn take(&mut self, count: usize) {
+        self.taken += count;
+    }
+
+    /// Whether the peer has closed.
+    pub(crate) fn closed(&self) -> bool {
+        self.closed
+    }
+
+    /// Writes from the front of `out` what the socket takes. A broken connection drops the rest: reading will tell.
+    pub(crate) fn write(&mut self, out: &mut Vec<u8>) {
+        let mut written = 0;
+        while written < out.len() {
+            match self.stream.write(&out[written..]) {
+                Ok(count) => written += count,
+                Err(error) if error.kind() == ErrorKind::Interrupted => {}
+                Err(error) if error.kind() == ErrorKind::WouldBlock => break,
+                Err(_) => written = out.len(),
+            }
+        }
+        out.drain(..written);
+    }
+
+    /// The peer's address, while connected.
+    pub(crate) fn peer(&self) -> Option<SocketAddr> {
+        self.stream.peer_addr().ok()
+    }
+
+    /// Says that nothing more will be written.
+    pub(crate) fn finish(&mut self) {
+        // A peer that is gone already is as finished as can be.
+        drop(self.stream.shutdown(Shutdown::Write));
+    }
+}
+
+/// Wakes a waiting federate from another thread.
+#[derive(Clone, Debug)]
+pub(crate) struct Waker(Arc<OwnedFd>);
+
+impl Waker {
+    pub(crate) fn new() -> io::Result<Self> {
+        Ok(Self(Arc::new(eventfd(
+            0,
+            EventfdFlags::NONBLOCK | EventfdFlags::CLOEXEC,
+        )?)))
+    }
+
+    pub(crate) fn wake(&self) {
+        // A full counter is a wake-up that is already pending.
+        let _ = rustix::io::write(&*self.0, &1_u64.to_ne_bytes());
+    }
+
+    fn clear(&self) {
+        let _ = rustix::io::read(&*self.0, &mut [0_u8; 8]);
+    }
+}
+
+/// SIGTERM and SIGINT as bytes on a socket.
+#[derive(Debug)]
+pub(crate) struct Signals {
+    stream: UnixStream,
+}
+
+impl Signals {
+    pub(crate) fn new() -> io::Result<Self> {
+        let (stream, writer) = UnixStream::pair()?;
+        stream.set_nonblocking(true)?;
+        writer.set_nonblocking(true)?;
+        for signal in [signal_hook::consts::SIGTERM, signal_hook::consts::SIGINT] {
+            signal_hook::low_level::pipe::register(signal, writer.try_clone()?)?;
+        }
+        Ok(Self { stream })
+    }
+
+    /// How many signals have come since the last call.
+    pub(crate) fn take(&mut self) -> usize {
+        let mut bytes = [0; 16];
+        self.stream.read(&mut bytes).unwrap_or(0)
+    }
+}
+
+/// What ended a wait.
+#[derive(Clone, Copy, Debug, Default)]
+pub(crate) struct Woken {
+    /// The connection has bytes, or its end.
+    pub(crate) readable: bool,
+    /// A signal came.
+    pub(crate) signal: bool,
+}
+
+/// Waits for bytes, room to write, a wake-up, a signal, or until `timeout` is over (`None`: for ever).
+///
+/// The time-out has nanosecond resolution; [`precise_waits`] makes the kernel honour it.
+pub(crate) fn wait(
+    connection: Option<&Connection>,
+    wants_write: bool,
+    waker: &Waker,
+    signals: &Signals,
+    timeout: Option<Duration>,
+) -> io::Result<Woken> {
+    let timeout = timeout.map(|t| {
+        let nanos = t.as_nanos().max(0);
+        Timespec {
+            tv_sec: nanos / 1_000_000_000,
+            tv_nsec: nanos % 1_000_000_000,
+        }
+    });
+    let base = [
+        PollFd::from_borrowed_fd(waker.0.as_fd(), PollFlags::IN),
+        PollFd::from_borrowed_fd(signals.stream.as_fd(), PollFlags::IN),
+    ];
+    let [waker_fd, signals_fd] = base;
+    let result;
+    let mut woken = Woken::default();
+    match connection.filter(|c| !c.closed) {
+        Some(connection) => {
+            let wanted = if wants_write {
+                PollFlags::IN | PollFlags::OUT
+            } else {
+                PollFlags::IN
+            };
+            let stream = PollFd::from_borrowed_fd(connection.stream.as_fd(), wanted);
+            let mut fds = [waker_fd, signals_fd, stream];
+            result = poll(&mut fds, timeout.as_ref());
+            let ready = PollFlags::IN | PollFlags::HUP | PollFlags::ERR;
+            woken.readable = fds[2].revents().intersects(ready);
+            woken.signal = !fds[1].revents().is_empty();
+        }
+        None => {
+            let mut fds = [waker_fd, signals_fd];
+            result = poll(&mut fds, timeout.as_ref());
+            woken.signal = !fds[1].revents().is_empty();
+        }
+    }
+    match result {
+        Ok(_) => {}
+        Err(Errno::INTR) => woken.signal = true,
+        Err(errno) => return Err(errno.into()),
+    }
+    waker.clear();
+    Ok(woken)
+}
+
+/// Makes this thread's waits end at their time: timer slack of 1 ns instead of 50 us.
+pub(crate) fn precise_waits() {
+    // Without it waits are only less precise.
+    let _ = rustix::thread::set_current_timer_slack(std::num::NonZeroU64::new(1));
+}
