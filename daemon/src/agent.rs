@@ -1,0 +1,973 @@
+//! One federation's life as a state machine without I/O: what processes say goes in, what to do comes out.
+//!
+//! After every `handle_*`, drain [`Agent::poll_action`] to `None`, then wait until [`Agent::poll_timeout`].
+//! A start is all or nothing: whatever fails before every federate has completed its first tag ends the
+//! others. Every wait has a bound; the ladder is stop consensus, SIGTERM, SIGKILL, giving up.
+
+use std::collections::VecDeque;
+use std::time::Duration;
+
+use ictus_coord::report::{FederateStatus, RtiStatus, exit};
+use ictus_deploy::{FederateKind, Settings};
+
+use crate::api::{Event, Failure, FailureKind, MemberView, Outcome, StartRequest, State};
+use crate::supervisor::exit::{Ending, ExitRecord};
+use crate::supervisor::protocol::StopSignal;
+
+/// The RTI's name among the members.
+pub const RTI: &str = "rti";
+/// How long after the last join the start may take: start consensus and the first tag.
+const FIRST_TAG_MAX: Duration = Duration::from_secs(60);
+/// How long after SIGTERM SIGKILL follows, and after SIGKILL the end is declared.
+const KILL_GRACE: Duration = Duration::from_secs(2);
+
+/// Two readings of the clock.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Now {
+    /// Monotonic, from any origin: waits are measured on it.
+    pub since: Duration,
+    /// Nanoseconds since the Unix epoch: what people read.
+    pub wall_ns: i64,
+}
+
+/// A process of the federation.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum MemberId {
+    /// The RTI.
+    Rti,
+    /// A federate: index into the plan.
+    Federate(u16),
+}
+
+/// What a member's supervisor says.
+#[derive(Clone, Debug, PartialEq)]
+pub enum MemberEvent {
+    /// The process was started.
+    Started {
+        /// Its id.
+        pid: u32,
+    },
+    /// A status line.
+    Reported {
+        /// The line.
+        line: serde_json::Value,
+    },
+    /// The process ended.
+    Ended {
+        /// Its record.
+        record: Box<ExitRecord>,
+    },
+    /// The supervisor could not be used; there is no process.
+    NotSupervised {
+        /// Why.
+        why: String,
+    },
+    /// What answers in the member's place is not ours.
+    Foreign {
+        /// How it was told.
+        why: String,
+    },
+    /// The supervisor is gone. Nothing follows. Without an end before, it was killed.
+    Closed,
+}
+
+/// What the driver must do.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Action {
+    /// Start a member; a federate gets the RTI's port.
+    Launch {
+        /// Who.
+        member: MemberId,
+        /// The RTI's port; absent for the RTI itself.
+        rti_port: Option<u16>,
+    },
+    /// Have its supervisor send a signal.
+    Signal {
+        /// To whom.
+        member: MemberId,
+        /// Which.
+        signal: StopSignal,
+    },
+    /// Tell everybody.
+    Tell(Event),
+}
+
+/// The state machine of one federation.
+#[derive(Debug)]
+pub struct Agent {
+    rti: Member,
+    federates: Vec<Member>,
+    settings: Settings,
+    phase: Phase,
+    rti_port: Option<u16>,
+    start_ns: Option<i64>,
+    was_healthy: bool,
+    failures: Vec<Ranked>,
+    actions: VecDeque<Action>,
+}
+
+#[derive(Debug)]
+struct Member {
+    name: String,
+    ours: bool,
+    process: Process,
+    pid: Option<u32>,
+    joined: bool,
+    running: bool,
+    /// The last `progress` or `ended` status.
+    view: MemberView,
+    reason: Option<String>,
+    signalled: Option<StopSignal>,
+}
+
+/// Where a member's process stands.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Process {
+    /// Not asked for yet.
+    Waiting,
+    /// Its supervisor is being started or found.
+    Launching,
+    Up,
+    /// Ended; its supervisor is still there.
+    Ended,
+    /// Its supervisor is gone, too.
+    Gone,
+    /// Not ours; never touched.
+    Foreign,
+}
+
+#[derive(Debug)]
+enum Phase {
+    Starting {
+        until: Duration,
+    },
+    Running,
+    Stopping {
+        why: Why,
+        step: Step,
+        until: Duration,
+        missed: Vec<String>,
+    },
+    Ended(Outcome),
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Why {
+    /// Nothing is left to do, or a federate asked: the program's own end.
+    Program,
+    Requested,
+    Failure,
+    Aborted,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Step {
+    /// Stop consensus is under way, or should be.
+    Consensus,
+    Terminated,
+    Killed,
+}
+
+/// A failure and how likely it is a consequence of another: 0 is a cause.
+#[derive(Debug)]
+struct Ranked {
+    rank: u8,
+    failure: Failure,
+}
+
+impl Agent {
+    /// Begins a start: the first action launches the RTI.
+    #[must_use]
+    pub fn start(now: Now, request: &StartRequest) -> Self {
+        let until = now.since + request.settings.join_timeout;
+        let mut agent = Self::new(request, Phase::Starting { until });
+        agent.launch(MemberId::Rti);
+        agent
+    }
+
+    /// Takes over a run that another daemon started. The driver then hands in what each supervisor says,
+    /// from the beginning. `launched` tells which members have a record; the others were never started.
+    #[must_use]
+    pub fn adopt(
+        now: Now,
+        request: &StartRequest,
+        state: State,
+        launched: impl Fn(MemberId) -> bool,
+    ) -> Self {
+        let mut agent = Self::new(request, Phase::Running);
+        for id in agent.ids() {
+            if launched(id) {
+                agent.member_mut(id).process = Process::Launching;
+            }
+        }
+        match state {
+            State::Running => agent.was_healthy = true,
+            State::Starting => agent.undo(now, Why::Aborted),
+            State::Stopping | State::Ended => {
+                agent.was_healthy = true;
+                agent.begin_stop(now, Why::Requested);
+            }
+        }
+        agent
+    }
+
+    fn new(request: &StartRequest, phase: Phase) -> Self {
+        let federates = request.federates.iter();
+        Self {
+            rti: Member::new(RTI, true),
+            federates: federates
+                .map(|run| Member::new(&run.name, run.kind == FederateKind::Ours))
+                .collect(),
+            settings: request.settings.clone(),
+            phase,
+            rti_port: None,
+            start_ns: None,
+            was_healthy: false,
+            failures: Vec::new(),
+            actions: VecDeque::new(),
+        }
+    }
+
+    /// Takes what a member's supervisor said.
+    pub fn handle_member(&mut self, now: Now, id: MemberId, event: MemberEvent) {
+        match event {
+            MemberEvent::Started { pid } => self.handle_started(id, pid),
+            MemberEvent::Reported { line } => self.handle_status(now, id, &line),
+            MemberEvent::Ended { record } => self.handle_end(now, id, &record),
+            MemberEvent::NotSupervised { why } => {
+                self.member_mut(id).process = Process::Gone;
+                let failure = self.failure(now, id, why);
+                self.fail(now, 0, failure);
+            }
+            MemberEvent::Foreign { why } => {
+                let member = self.member_mut(id);
+                member.process = Process::Foreign;
+                let name = member.name.clone();
+                self.tell(Event::Foreign {
+                    member: name,
+                    why: why.clone(),
+                });
+                let failure = self.failure(now, id, why);
+                self.fail(
+                    now,
+                    0,
+                    Failure {
+                        kind: FailureKind::Foreign,
+                        ..failure
+                    },
+                );
+            }
+            MemberEvent::Closed => self.handle_closed(now, id),
+        }
+        self.advance(now);
+    }
+
+    /// Takes a request to stop in order; during a start it undoes the start.
+    pub fn handle_stop(&mut self, now: Now) {
+        match self.phase {
+            Phase::Starting { .. } => self.undo(now, Why::Aborted),
+            Phase::Running => {
+                self.tell(Event::StopRequested {
+                    by: "user".to_owned(),
+                });
+                self.begin_stop(now, Why::Requested);
+            }
+            Phase::Stopping { .. } | Phase::Ended(_) => {}
+        }
+        self.advance(now);
+    }
+
+    /// Takes a request to end everything at once.
+    pub fn handle_kill(&mut self, now: Now) {
+        if matches!(self.phase, Phase::Starting { .. }) {
+            self.undo(now, Why::Aborted);
+        }
+        if matches!(self.phase, Phase::Running) {
+            self.begin_stop(now, Why::Requested);
+        }
+        self.kill(now);
+        self.advance(now);
+    }
+
+    /// Takes that who asked for the start is gone: before `healthy` that undoes it.
+    pub fn handle_starter_gone(&mut self, now: Now) {
+        if matches!(self.phase, Phase::Starting { .. }) {
+            self.undo(now, Why::Aborted);
+            self.advance(now);
+        }
+    }
+
+    /// Takes that the time of [`Agent::poll_timeout`] has come.
+    pub fn handle_timeout(&mut self, now: Now) {
+        if self.poll_timeout().is_none_or(|until| now.since < until) {
+            return;
+        }
+        match &self.phase {
+            Phase::Starting { .. } => {
+                let failure = self.failure(now, MemberId::Rti, self.late());
+                let kind = FailureKind::Timeout;
+                self.fail(
+                    now,
+                    0,
+                    Failure {
+                        kind,
+                        member: None,
+                        ..failure
+                    },
+                );
+            }
+            Phase::Stopping {
+                step: Step::Consensus,
+                ..
+            } => self.terminate(now),
+            Phase::Stopping {
+                step: Step::Terminated,
+                ..
+            } => self.kill(now),
+            Phase::Stopping {
+                step: Step::Killed, ..
+            } => self.give_up(),
+            Phase::Running | Phase::Ended(_) => {}
+        }
+        self.advance(now);
+    }
+
+    /// When [`Agent::handle_timeout`] must be called, on the monotonic clock.
+    #[must_use]
+    pub fn poll_timeout(&self) -> Option<Duration> {
+        match &self.phase {
+            Phase::Starting { until } | Phase::Stopping { until, .. } => Some(*until),
+            Phase::Running | Phase::Ended(_) => None,
+        }
+    }
+
+    /// What the driver must do next.
+    #[must_use]
+    pub fn poll_action(&mut self) -> Option<Action> {
+        self.actions.pop_front()
+    }
+
+    /// How it ended, once nothing runs any more.
+    #[must_use]
+    pub fn outcome(&self) -> Option<&Outcome> {
+        match &self.phase {
+            Phase::Ended(outcome) => Some(outcome),
+            Phase::Starting { .. } | Phase::Running | Phase::Stopping { .. } => None,
+        }
+    }
+
+    /// Where the federation stands.
+    #[must_use]
+    pub fn state(&self) -> State {
+        match self.phase {
+            Phase::Starting { .. } => State::Starting,
+            Phase::Running => State::Running,
+            Phase::Stopping { .. } => State::Stopping,
+            Phase::Ended(_) => State::Ended,
+        }
+    }
+
+    /// The RTI's port once it listens.
+    #[must_use]
+    pub fn rti_port(&self) -> Option<u16> {
+        self.rti_port
+    }
+
+    /// The start tag's time once it is agreed.
+    #[must_use]
+    pub fn start_ns(&self) -> Option<i64> {
+        self.start_ns
+    }
+
+    /// How the RTI is.
+    #[must_use]
+    pub fn rti_view(&self) -> MemberView {
+        self.rti.view()
+    }
+
+    /// How the federates are.
+    #[must_use]
+    pub fn federate_views(&self) -> Vec<MemberView> {
+        self.federates.iter().map(Member::view).collect()
+    }
+
+    fn handle_started(&mut self, id: MemberId, pid: u32) {
+        let member = self.member_mut(id);
+        member.process = Process::Up;
+        member.pid = Some(pid);
+        let name = member.name.clone();
+        let started = self
+            .federates
+            .iter()
+            .filter(|member| member.pid.is_some())
+            .count();
+        self.tell(Event::Started {
+            member: name,
+            pid,
+            started,
+            of: self.federates.len(),
+        });
+    }
+
+    fn handle_status(&mut self, now: Now, id: MemberId, line: &serde_json::Value) {
+        // A line of another version, or a foreign program's, tells nothing.
+        match id {
+            MemberId::Rti => {
+                if let Ok(status) = serde_json::from_value(line.clone()) {
+                    self.handle_rti_status(now, status);
+                }
+            }
+            MemberId::Federate(index) => {
+                if let Ok(status) = serde_json::from_value(line.clone()) {
+                    self.handle_federate_status(usize::from(index), status);
+                }
+            }
+        }
+    }
+
+    fn handle_rti_status(&mut self, now: Now, status: RtiStatus) {
+        match status {
+            RtiStatus::Listening { port } => self.handle_listening(port),
+            RtiStatus::Joined { federate } => {
+                if let Some(member) = self.federates.get_mut(usize::from(federate)) {
+                    member.joined = true;
+                }
+                let joined = self.federates.iter().filter(|member| member.joined).count();
+                let of = self.federates.len();
+                if let Phase::Starting { until } = &mut self.phase
+                    && joined == of
+                {
+                    *until = now.since + FIRST_TAG_MAX;
+                }
+                self.tell(Event::Joined {
+                    federate: self.name(federate),
+                    joined,
+                    of,
+                });
+            }
+            RtiStatus::Start { start_ns } => {
+                self.start_ns = Some(start_ns);
+                self.tell(Event::StartTag { start_ns });
+            }
+            RtiStatus::StopRequested { federate } => {
+                let by = federate.map_or_else(|| RTI.to_owned(), |id| self.name(id));
+                self.tell(Event::StopRequested { by });
+                if matches!(self.phase, Phase::Running) {
+                    self.expect_stop(now, Why::Program);
+                }
+            }
+            RtiStatus::Stop {
+                elapsed_ns,
+                microstep,
+            } => {
+                self.wait_for_stop_tag(now, elapsed_ns);
+                self.tell(Event::StopTag {
+                    elapsed_ns,
+                    microstep,
+                });
+            }
+            RtiStatus::Resigned { federate } => {
+                self.tell(Event::Resigned {
+                    federate: self.name(federate),
+                });
+            }
+            RtiStatus::Failed { federate, reason } => {
+                self.tell(Event::Lost {
+                    federate: self.name(federate),
+                    reason: reason.clone(),
+                });
+                let lost = self.federates.get(usize::from(federate));
+                if lost.is_some_and(|member| member.signalled.is_none()) {
+                    // The exit record says more, and ranks before this.
+                    let what = format!("was lost: {reason}");
+                    let failure = self.failure(now, MemberId::Federate(federate), what);
+                    self.fail(now, 1, failure);
+                }
+            }
+            RtiStatus::Rejected { peer, reason } => self.tell(Event::Rejected { peer, reason }),
+            RtiStatus::Ended { .. } => {}
+        }
+    }
+
+    fn handle_listening(&mut self, port: u16) {
+        self.rti_port = Some(port);
+        self.tell(Event::Listening { port });
+        if matches!(self.phase, Phase::Starting { .. }) {
+            for id in self.ids() {
+                self.launch(id);
+            }
+        }
+    }
+
+    fn handle_federate_status(&mut self, index: usize, status: FederateStatus) {
+        let Some(member) = self.federates.get_mut(index) else {
+            return;
+        };
+        match status {
+            // The RTI says these, for foreign federates as well.
+            FederateStatus::Joined { .. } | FederateStatus::Start { .. } => {}
+            FederateStatus::Running { .. } => {
+                member.running = true;
+                let federate = member.name.clone();
+                let ours = || self.federates.iter().filter(|member| member.ours);
+                let running = ours().filter(|member| member.running).count();
+                let of = ours().count();
+                self.tell(Event::Running {
+                    federate,
+                    running,
+                    of,
+                });
+            }
+            FederateStatus::Progress {
+                elapsed_ns,
+                tags,
+                reactions,
+                deadlines_missed,
+                ..
+            } => {
+                member.view.elapsed_ns = Some(elapsed_ns);
+                member.view.tags = Some(tags);
+                member.view.reactions = Some(reactions);
+                member.view.deadlines_missed = Some(deadlines_missed);
+            }
+            FederateStatus::Ended {
+                elapsed_ns, reason, ..
+            } => {
+                member.view.elapsed_ns = Some(elapsed_ns);
+                member.reason = Some(reason);
+            }
+        }
+    }
+
+    fn handle_end(&mut self, now: Now, id: MemberId, record: &ExitRecord) {
+        let starting = matches!(self.phase, Phase::Starting { .. });
+        let start_agreed = self.start_ns.is_some();
+        let others_live = self.others_live(id);
+        let member = self.member_mut(id);
+        member.process = Process::Ended;
+        member.pid = record.pid;
+        let how = record.ending.describe();
+        member.view.ending = Some(how.clone());
+        let ran = if member.ours {
+            member.running
+        } else {
+            start_agreed
+        };
+        let premature = match id {
+            MemberId::Rti => others_live,
+            MemberId::Federate(_) => starting && !ran,
+        };
+        let (name, reason) = (member.name.clone(), member.reason.clone());
+        self.tell(Event::Exited {
+            member: name,
+            how: how.clone(),
+            reason: reason.clone(),
+        });
+        if let Some(rank) = self.rank(id, &record.ending, premature) {
+            let what = match reason {
+                Some(reason) => format!("{how}: {reason}"),
+                None if !premature || !record.ending.success() => how,
+                None if starting => format!("{how} before the start"),
+                None => format!("{how} before its federates"),
+            };
+            let at = Now {
+                wall_ns: record.ended_ns,
+                ..now
+            };
+            let failure = self.failure(at, id, what);
+            self.fail(
+                now,
+                rank,
+                Failure {
+                    lines: record.first_lines.clone(),
+                    ..failure
+                },
+            );
+        }
+        if matches!(self.phase, Phase::Running) && !self.federates.iter().any(Member::lives) {
+            self.expect_stop(now, Why::Program);
+        }
+    }
+
+    /// Whether an end is a failure, and how likely only a consequence of another; absent when it is none.
+    fn rank(&self, id: MemberId, ending: &Ending, premature: bool) -> Option<u8> {
+        let signalled = self.member(id).signalled;
+        match ending {
+            Ending::Exited { code: 0 } => (premature && signalled.is_none()).then_some(1),
+            Ending::Exited { code } => match u8::try_from(*code) {
+                Ok(exit::RTI_LOST | exit::PEER_FAILED) => self.unless_ladder(3),
+                Ok(exit::NOT_JOINED) => self.unless_ladder(2),
+                // It says that a federate failed.
+                _ if id == MemberId::Rti && !premature => self.unless_ladder(3),
+                _ => Some(0),
+            },
+            Ending::Killed { signal: 15 } if signalled.is_some() => None,
+            Ending::Killed { signal: 9 } if signalled == Some(StopSignal::Kill) => None,
+            Ending::Killed { .. } | Ending::NotStarted { .. } | Ending::Unknown => Some(0),
+        }
+    }
+
+    /// Once we signal federates ourselves, what others say about lost peers is our doing.
+    fn unless_ladder(&self, rank: u8) -> Option<u8> {
+        let ladder = self
+            .federates
+            .iter()
+            .any(|member| member.signalled.is_some());
+        (!ladder).then_some(rank)
+    }
+
+    fn handle_closed(&mut self, now: Now, id: MemberId) {
+        let member = self.member_mut(id);
+        match member.process {
+            Process::Launching | Process::Up => {
+                member.process = Process::Gone;
+                let how = Ending::Unknown.describe();
+                member.view.ending = Some(how.clone());
+                let name = member.name.clone();
+                self.tell(Event::Exited {
+                    member: name,
+                    how: how.clone(),
+                    reason: None,
+                });
+                let failure = self.failure(now, id, how);
+                self.fail(now, 0, failure);
+            }
+            Process::Ended => member.process = Process::Gone,
+            Process::Waiting | Process::Gone | Process::Foreign => {}
+        }
+    }
+
+    /// Notes a failure and begins to end the rest.
+    fn fail(&mut self, now: Now, rank: u8, failure: Failure) {
+        self.failures.push(Ranked { rank, failure });
+        match self.phase {
+            Phase::Starting { .. } => self.undo(now, Why::Failure),
+            Phase::Running => self.expect_stop(now, Why::Failure),
+            Phase::Stopping { .. } | Phase::Ended(_) => {}
+        }
+    }
+
+    fn failure(&self, now: Now, id: MemberId, what: String) -> Failure {
+        Failure {
+            kind: FailureKind::Process,
+            member: Some(self.member(id).name.clone()),
+            what,
+            lines: Vec::new(),
+            log: None,
+            at_ns: now.wall_ns,
+        }
+    }
+
+    /// Asks the RTI for stop consensus.
+    fn begin_stop(&mut self, now: Now, why: Why) {
+        self.expect_stop(now, why);
+        self.signal(MemberId::Rti, StopSignal::Term);
+    }
+
+    /// The RTI or the federates are ending by themselves; bounds how long.
+    fn expect_stop(&mut self, now: Now, why: Why) {
+        let until = now.since + self.settings.stop_grace;
+        self.phase = Phase::Stopping {
+            why,
+            step: Step::Consensus,
+            until,
+            missed: Vec::new(),
+        };
+    }
+
+    /// The stop tag may lie in the future of physical time: the grace counts from it.
+    fn wait_for_stop_tag(&mut self, now: Now, elapsed_ns: i64) {
+        let grace = self.settings.stop_grace;
+        let stop_ns = self
+            .start_ns
+            .and_then(|start| start.checked_add(elapsed_ns));
+        let ahead_ns = stop_ns.map_or(0, |stop| stop.saturating_sub(now.wall_ns));
+        let ahead = Duration::from_nanos(u64::try_from(ahead_ns).unwrap_or(0));
+        if let Phase::Stopping {
+            step: Step::Consensus,
+            until,
+            ..
+        } = &mut self.phase
+        {
+            *until = now.since.saturating_add(ahead).saturating_add(grace);
+        }
+    }
+
+    /// Ends everything without consensus: nothing has run yet that could be finished.
+    fn undo(&mut self, now: Now, why: Why) {
+        let until = now.since + KILL_GRACE;
+        self.phase = Phase::Stopping {
+            why,
+            step: Step::Terminated,
+            until,
+            missed: Vec::new(),
+        };
+        for id in self.ids() {
+            self.signal(id, StopSignal::Term);
+        }
+    }
+
+    fn terminate(&mut self, now: Now) {
+        let late: Vec<_> = self
+            .federate_ids()
+            .filter(|id| self.member(*id).lives())
+            .collect();
+        let names: Vec<_> = late
+            .iter()
+            .map(|id| self.member(*id).name.clone())
+            .collect();
+        if let Phase::Stopping {
+            step,
+            until,
+            missed,
+            ..
+        } = &mut self.phase
+        {
+            *step = Step::Terminated;
+            *until = now.since + KILL_GRACE;
+            missed.clone_from(&names);
+        }
+        // Without federates it is the RTI that hangs.
+        let targets = if late.is_empty() {
+            vec![MemberId::Rti]
+        } else {
+            late
+        };
+        let names = if names.is_empty() {
+            vec![RTI.to_owned()]
+        } else {
+            names
+        };
+        self.tell(Event::Signalled {
+            signal: "SIGTERM".to_owned(),
+            members: names,
+        });
+        for id in targets {
+            self.signal(id, StopSignal::Term);
+        }
+    }
+
+    fn kill(&mut self, now: Now) {
+        let Phase::Stopping { step, until, .. } = &mut self.phase else {
+            return;
+        };
+        *step = Step::Killed;
+        *until = now.since + KILL_GRACE;
+        let late: Vec<_> = self
+            .ids()
+            .into_iter()
+            .filter(|id| self.member(*id).lives())
+            .collect();
+        if late.is_empty() {
+            return;
+        }
+        let members = late
+            .iter()
+            .map(|id| self.member(*id).name.clone())
+            .collect();
+        self.tell(Event::Signalled {
+            signal: "SIGKILL".to_owned(),
+            members,
+        });
+        for id in late {
+            self.signal(id, StopSignal::Kill);
+        }
+    }
+
+    /// Not even SIGKILL helped: a process in uninterruptible sleep, or a supervisor that hangs.
+    fn give_up(&mut self) {
+        for id in self.ids() {
+            let member = self.member_mut(id);
+            if member.process != Process::Waiting && member.process != Process::Foreign {
+                member
+                    .view
+                    .ending
+                    .get_or_insert_with(|| "did not end after SIGKILL".to_owned());
+                member.process = Process::Gone;
+            }
+        }
+    }
+
+    /// Moves to the next phase when its condition holds.
+    fn advance(&mut self, now: Now) {
+        if matches!(self.phase, Phase::Starting { .. })
+            && self.start_ns.is_some()
+            && self
+                .federates
+                .iter()
+                .all(|member| member.joined && (member.running || !member.ours))
+        {
+            self.was_healthy = true;
+            self.phase = Phase::Running;
+            self.tell(Event::Healthy);
+            if !self.federates.iter().any(Member::lives) {
+                self.expect_stop(now, Why::Program);
+            }
+        }
+        let gone = |member: &Member| {
+            matches!(
+                member.process,
+                Process::Waiting | Process::Gone | Process::Foreign
+            )
+        };
+        if self.outcome().is_none() && gone(&self.rti) && self.federates.iter().all(gone) {
+            let outcome = self.conclude();
+            self.tell(Event::Ended {
+                outcome: outcome.clone(),
+            });
+            self.phase = Phase::Ended(outcome);
+        }
+    }
+
+    fn conclude(&mut self) -> Outcome {
+        let first = self
+            .failures
+            .drain(..)
+            .min_by_key(|it| (it.rank, it.failure.at_ns));
+        match (first, &mut self.phase) {
+            (
+                _,
+                Phase::Stopping {
+                    why: Why::Aborted, ..
+                },
+            ) => Outcome::Aborted,
+            (Some(Ranked { failure, .. }), _) => Outcome::Failed {
+                failure,
+                was_healthy: self.was_healthy,
+            },
+            (
+                None,
+                Phase::Stopping {
+                    why: Why::Requested,
+                    missed,
+                    ..
+                },
+            ) => Outcome::Stopped {
+                missed: std::mem::take(missed),
+            },
+            (None, _) => Outcome::Completed,
+        }
+    }
+
+    /// Why the start takes too long.
+    fn late(&self) -> String {
+        let names = |late: &dyn Fn(&Member) -> bool| {
+            let late = self.federates.iter().filter(|member| late(member));
+            late.map(|member| member.name.as_str())
+                .collect::<Vec<_>>()
+                .join(", ")
+        };
+        let missing = names(&|member| !member.joined);
+        if self.rti_port.is_none() {
+            "the RTI does not listen".to_owned()
+        } else if !missing.is_empty() {
+            format!("not joined in time: {missing}")
+        } else if self.start_ns.is_none() {
+            "no start tag was agreed in time".to_owned()
+        } else {
+            let waiting = names(&|member| member.ours && !member.running);
+            format!("the first tag was not completed in time by: {waiting}")
+        }
+    }
+
+    fn launch(&mut self, member: MemberId) {
+        let rti_port = self.rti_port;
+        let state = self.member_mut(member);
+        if state.process == Process::Waiting {
+            state.process = Process::Launching;
+            self.actions.push_back(Action::Launch { member, rti_port });
+        }
+    }
+
+    fn signal(&mut self, member: MemberId, signal: StopSignal) {
+        let state = self.member_mut(member);
+        if state.lives() {
+            state.signalled = state.signalled.max(Some(signal));
+            self.actions.push_back(Action::Signal { member, signal });
+        }
+    }
+
+    fn tell(&mut self, event: Event) {
+        self.actions.push_back(Action::Tell(event));
+    }
+
+    fn others_live(&self, id: MemberId) -> bool {
+        self.federate_ids()
+            .any(|other| other != id && self.member(other).lives())
+    }
+
+    fn ids(&self) -> Vec<MemberId> {
+        std::iter::once(MemberId::Rti)
+            .chain(self.federate_ids())
+            .collect()
+    }
+
+    fn federate_ids(&self) -> impl Iterator<Item = MemberId> + use<> {
+        (0..u16::try_from(self.federates.len()).unwrap_or(u16::MAX)).map(MemberId::Federate)
+    }
+
+    fn name(&self, federate: u16) -> String {
+        let member = self.federates.get(usize::from(federate));
+        member.map_or_else(
+            || format!("federate {federate}"),
+            |member| member.name.clone(),
+        )
+    }
+
+    fn member(&self, id: MemberId) -> &Member {
+        match id {
+            MemberId::Rti => &self.rti,
+            MemberId::Federate(index) => &self.federates[usize::from(index)],
+        }
+    }
+
+    fn member_mut(&mut self, id: MemberId) -> &mut Member {
+        match id {
+            MemberId::Rti => &mut self.rti,
+            MemberId::Federate(index) => &mut self.federates[usize::from(index)],
+        }
+    }
+}
+
+impl Member {
+    fn new(name: &str, ours: bool) -> Self {
+        Self {
+            name: name.to_owned(),
+            ours,
+            process: Process::Waiting,
+            pid: None,
+            joined: false,
+            running: false,
+            view: MemberView {
+                name: name.to_owned(),
+                ..MemberView::default()
+            },
+            reason: None,
+            signalled: None,
+        }
+    }
+
+    fn lives(&self) -> bool {
+        matches!(self.process, Process::Launching | Process::Up)
+    }
+
+    fn view(&self) -> MemberView {
+        let state = match self.process {
+            Process::Waiting => "waiting",
+            Process::Launching => "launching",
+            Process::Up if self.running => "running",
+            Process::Up if self.joined => "joined",
+            Process::Up => "up",
+            Process::Ended | Process::Gone => "ended",
+            Process::Foreign => "foreign",
+        };
+        MemberView {
+            state: state.to_owned(),
+            pid: self.pid,
+            ..self.view.clone()
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,308 @@
+//! What is on disk of each federation: `STATE/federations/NAME/`.
+
+use std::collections::BTreeMap;
+use std::fs::{self, DirBuilder, OpenOptions};
+use std::io::{self, Write};
+use std::os::unix::fs::DirBuilderExt;
+use std::path::{Path, PathBuf};
+
+use serde::{Deserialize, Serialize};
+
+use crate::api::{FederationView, Happening, StartRequest};
+use crate::files;
+use crate::identity::ProcessIdentity;
+use crate::supervisor::spec::PROTOCOL;
+
+/// The longest federation or federate name.
+const NAME_BYTES_MAX: usize = 100;
+/// Bytes of `events.ndjson`; later events are told but not kept.
+const EVENTS_BYTES_MAX: u64 = 4 << 20;
+
+/// The directory of one federation's last run.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Directory(PathBuf);
+
+/// What a later daemon needs to take a run over.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Record {
+    /// Always [`PROTOCOL`]; a newer one is refused.
+    pub protocol: u32,
+    /// Members by name; each is entered before its supervisor is started.
+    pub members: BTreeMap<String, Supervised>,
+    /// The federation as it was when the record was written.
+    pub view: FederationView,
+}
+
+/// A supervisor that was started.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Supervised {
+    /// The random id it answers with.
+    pub instance: String,
+    /// The process, once it has answered.
+    pub supervisor: Option<ProcessIdentity>,
+}
+
+/// Why a stored run cannot be read.
+#[derive(Debug, thiserror::Error)]
+pub enum StoreError {
+    /// A file cannot be read or written.
+    #[error("cannot use {path}", path = path.display())]
+    Io {
+        /// The file.
+        path: PathBuf,
+        /// Why.
+        source: io::Error,
+    },
+    /// A file is not what it should be.
+    #[error("{path} is damaged", path = path.display())]
+    Damaged {
+        /// The file.
+        path: PathBuf,
+        /// How.
+        source: serde_json::Error,
+    },
+    /// The record was written by a newer version. Use that one.
+    #[error("{path} is of protocol {found}; this is {PROTOCOL}", path = path.display())]
+    Newer {
+        /// The file.
+        path: PathBuf,
+        /// Its version.
+        found: u32,
+    },
+}
+
+/// Whether a name may be a federation's or federate's: letters, digits, `_`, `-`, `.`; it must not begin with
+/// `.` or `-`.
+#[must_use]
+pub fn is_name(name: &str) -> bool {
+    let allowed = |byte: u8| byte.is_ascii_alphanumeric() || b"_-.".contains(&byte);
+    !name.is_empty()
+        && name.len() <= NAME_BYTES_MAX
+        && name.bytes().all(allowed)
+        && !name.starts_with(['.', '-'])
+}
+
+/// Names of federations with anything on disk, sorted.
+#[must_use]
+pub fn names(federations: &Path) -> Vec<String> {
+    let entries = fs::read_dir(federations).into_iter().flatten().flatten();
+    let names = entries.filter_map(|entry| entry.file_name().into_string().ok());
+    let mut names: Vec<_> = names.filter(|name| is_name(name)).collect();
+    names.sort();
+    names
+}
+
+impl Directory {
+    /// The directory of this federation, whether it exists or not.
+    #[must_use]
+    pub fn of(federations: &Path, name: &str) -> Self {
+        Self(federations.join(name))
+    }
+
+    /// Itself.
+    #[must_use]
+    pub fn path(&self) -> &Path {
+        &self.0
+    }
+
+    /// The plan that federates read.
+    #[must_use]
+    pub fn plan(&self) -> PathBuf {
+        self.0.join("plan.json")
+    }
+
+    /// What `ictus timing` is to print.
+    #[must_use]
+    pub fn timing_spec(&self) -> PathBuf {
+        self.0.join("timing.json")
+    }
+
+    /// Logs.
+    #[must_use]
+    pub fn logs(&self) -> PathBuf {
+        self.0.join("logs")
+    }
+
+    /// Logical traces.
+    #[must_use]
+    pub fn trace(&self) -> PathBuf {
+        self.0.join("trace")
+    }
+
+    /// Timing files.
+    #[must_use]
+    pub fn timing(&self) -> PathBuf {
+        self.0.join("timing")
+    }
+
+    /// A member's exit record.
+    #[must_use]
+    pub fn exit_record(&self, member: &str) -> PathBuf {
+        self.0.join("exit").join(format!("{member}.json"))
+    }
+
+    /// A member's supervisor's spec.
+    #[must_use]
+    pub fn spec(&self, member: &str) -> PathBuf {
+        self.0.join("spec").join(format!("{member}.json"))
+    }
+
+    fn request(&self) -> PathBuf {
+        self.0.join("request.json")
+    }
+
+    fn record(&self) -> PathBuf {
+        self.0.join("record.json")
+    }
+
+    fn events(&self) -> PathBuf {
+        self.0.join("events.ndjson")
+    }
+
+    /// Clears what an earlier run left and writes what this one needs.
+    ///
+    /// # Errors
+    /// When the disk does not take it.
+    pub fn prepare(&self, request: &StartRequest) -> Result<(), StoreError> {
+        files::remove(&self.0).map_err(io_at(&self.0))?;
+        let exit = self.0.join("exit");
+        for directory in [
+            self.logs(),
+            self.trace(),
+            self.timing(),
+            exit,
+            self.0.join("spec"),
+        ] {
+            let mut builder = DirBuilder::new();
+            builder
+                .recursive(true)
+                .mode(0o700)
+                .create(&directory)
+                .map_err(io_at(&directory))?;
+        }
+        write(&self.plan(), &request.plan)?;
+        write(&self.timing_spec(), &request.timing)?;
+        write(&self.request(), request)
+    }
+
+    /// Reads what the run was started from.
+    ///
+    /// # Errors
+    /// When it cannot be read.
+    pub fn read_request(&self) -> Result<StartRequest, StoreError> {
+        read(&self.request())
+    }
+
+    /// Reads the record; absent when there is none.
+    ///
+    /// # Errors
+    /// When it is damaged or from a newer version.
+    pub fn read_record(&self) -> Result<Option<Record>, StoreError> {
+        let path = self.record();
+        if !path.exists() {
+            return Ok(None);
+        }
+        let value: serde_json::Value = read(&path)?;
+        let found = value.get("protocol").and_then(serde_json::Value::as_u64);
+        if let Some(found) = found.and_then(|it| u32::try_from(it).ok())
+            && found > PROTOCOL
+        {
+            return Err(StoreError::Newer { path, found });
+        }
+        let damaged = |source| StoreError::Damaged { path, source };
+        serde_json::from_value(value).map(Some).map_err(damaged)
+    }
+
+    /// Writes the record durably.
+    ///
+    /// # Errors
+    /// When the disk does not take it.
+    pub fn write_record(&self, record: &Record) -> Result<(), StoreError> {
+        write(&self.record(), record)
+    }
+
+    /// Keeps an event.
+    ///
+    /// # Errors
+    /// When the disk does not take it.
+    pub fn append_event(&self, happening: &Happening) -> io::Result<()> {
+        let mut file = OpenOptions::new()
+            .append(true)
+            .create(true)
+            .open(self.events())?;
+        if file.metadata()?.len() > EVENTS_BYTES_MAX {
+            return Ok(());
+        }
+        let mut line = serde_json::to_vec(happening)?;
+        line.push(b'\n');
+        file.write_all(&line)
+    }
+
+    /// The events kept, in order; lines that are none are left out.
+    #[must_use]
+    pub fn events_kept(&self) -> Vec<Happening> {
+        let text = fs::read_to_string(self.events()).unwrap_or_default();
+        text.lines()
+            .filter_map(|line| serde_json::from_str(line).ok())
+            .collect()
+    }
+
+    /// Removes all but what a person may want to read after the end (logs, traces, timing files, plan, events,
+    /// exit records), or with `purge` everything; gives what is left.
+    ///
+    /// # Errors
+    /// When something cannot be removed.
+    pub fn remove(&self, purge: bool) -> Result<Vec<PathBuf>, StoreError> {
+        if purge {
+            files::remove(&self.0).map_err(io_at(&self.0))?;
+            return Ok(Vec::new());
+        }
+        for path in [self.request(), self.record(), self.0.join("spec")] {
+            files::remove(&path).map_err(io_at(&path))?;
+        }
+        let filled = |path: &PathBuf| fs::read_dir(path).is_ok_and(|mut it| it.next().is_some());
+        Ok([self.logs(), self.trace(), self.timing()]
+            .into_iter()
+            .filter(filled)
+            .collect())
+    }
+}
+
+fn write(path: &Path, value: &impl Serialize) -> Result<(), StoreError> {
+    let bytes = serde_json::to_vec_pretty(value).map_err(|source| StoreError::Damaged {
+        path: path.to_path_buf(),
+        source,
+    })?;
+    files::write_durably(path, &bytes).map_err(io_at(path))
+}
+
+fn read<T: for<'de> Deserialize<'de>>(path: &Path) -> Result<T, StoreError> {
+    let bytes = fs::read(path).map_err(io_at(path))?;
+    serde_json::from_slice(&bytes).map_err(|source| StoreError::Damaged {
+        path: path.to_path_buf(),
+        source,
+    })
+}
+
+fn io_at(path: &Path) -> impl Fn(io::Error) -> StoreError + use<> {
+    let path = path.to_path_buf();
+    move |source| StoreError::Io {
+        path: path.clone(),
+        source,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::is_name;
+
+    #[test]
+    fn names_cannot_leave_their_directory() {
+        for good in ["diamond", "a.b-c_d", "7"] {
+            assert!(is_name(good), "{good}");
+        }
+        for bad in ["", ".", "..", "-x", "a/b", "a b", "ä"] {
+            assert!(!is_name(bad), "{bad}");
+        }
+    }
+}
