@@ -7,6 +7,7 @@ pub mod mutants;
 mod payload;
 pub mod plan;
 pub mod report;
+pub mod rti;
 pub mod topology;
 pub mod wire;
 

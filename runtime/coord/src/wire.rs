@@ -341,14 +341,66 @@ pub fn encode_tagged_message(
     payload: impl FnOnce(&mut Vec<u8>),
 ) {
     let start = out.len();
-    ToRti::TaggedMessage(TaggedMessage { port, federate, tag, payload: &[] }).encode(out);
+    ToRti::TaggedMessage(TaggedMessage {
+        port,
+        federate,
+        tag,
+        payload: &[],
+    })
+    .encode(out);
     let body = out.len();
     payload(out);
     let length = u32::try_from(out.len() - body).expect("payloads are shorter than 4 GiB");
     out[start + 5..start + 9].copy_from_slice(&length.to_le_bytes());
 }
 
+impl<'a> TaggedMessage<'a> {
+    /// Decodes the TAGGED_MESSAGE at the start of `bytes` and says how many bytes it takes; `None` when more are needed,
+    /// or when it is another message.
+    ///
+    /// # Errors
+    ///
+    /// When the payload is longer than `max_payload` bytes.
+    #[inline]
+    pub fn decode_limited(
+        bytes: &'a [u8],
+        max_payload: u32,
+    ) -> Result<Option<(Self, usize)>, DecodeError> {
+        let mut r = Reader::new(bytes);
+        if r.u8() != Some(kind::TAGGED_MESSAGE) {
+            return Ok(None);
+        }
+        Ok(r.message(max_payload)?
+            .map(|message| (message, r.consumed())))
+    }
+}
+
 impl<'a> ToRti<'a> {
+    /// The message's name in LF's terms, for people.
+    #[must_use]
+    pub const fn name(&self) -> &'static str {
+        match self {
+            Self::FederateIds { .. } => "FED_IDS",
+            Self::Timestamp(_) => "TIMESTAMP",
+            Self::TaggedMessage(_) => "TAGGED_MESSAGE",
+            Self::PortAbsent(_) => "PORT_ABSENT",
+            Self::NextEventTag(_) => "NET",
+            Self::LatestTagConfirmed(_) => "LTC",
+            Self::StopRequest(_) => "STOP_REQUEST",
+            Self::StopRequestReply(_) => "STOP_REQUEST_REPLY",
+            Self::Resign => "RESIGN",
+            Self::Failed => "FAILED",
+            Self::NeighborStructure(_) => "NEIGHBOR_STRUCTURE",
+            Self::UdpPort(_) => "UDP_PORT",
+            Self::ClockSyncT3 { .. } => "CLOCK_SYNC_T3",
+            Self::AddressQuery { .. } => "ADDRESS_QUERY",
+            Self::AddressAdvertisement { .. } => "ADDRESS_ADVERTISEMENT",
+            Self::FederateNonce { .. } => "FED_NONCE",
+            Self::FederateResponse { .. } => "FED_RESPONSE",
+            Self::Capabilities(_) => "CAPABILITIES",
+        }
+    }
+
     /// Appends the message's bytes to `out`.
     ///
     /// Law `to_rti_round_trip`: decoding gives the message back.
