@@ -1,1 +1,0 @@
-//! End to end, interoperability, tidy. Imports everything, imported by nothing.

@@ -1,0 +1,147 @@
+//! The house rules that a compiler does not check: import arrows, file length, leftovers, links.
+
+#![expect(clippy::unwrap_used, reason = "a test stops at the first surprise")]
+
+use serde_json::Value;
+use std::collections::BTreeSet;
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+/// Who may import whom among our crates (ARCHITECTURE.md); `tests` imports everything and is not listed.
+const ARROWS: &[(&str, &[&str])] = &[
+    ("ictus-core", &[]),
+    ("ictus-macros", &[]),
+    ("ictus-coord", &["ictus-core"]),
+    ("ictus-sim", &["ictus-core", "ictus-coord"]),
+    ("ictus", &["ictus-core", "ictus-coord", "ictus-macros", "ictus-sim"]),
+    ("ictus-rti", &["ictus-core", "ictus-coord"]),
+    ("ictus-deploy", &["ictus-core", "ictus-coord"]),
+    ("ictusd", &["ictus-core", "ictus-coord", "ictus-deploy", "ictus-rti"]),
+    ("ictus-cli", &["ictus-core", "ictus-coord", "ictus-deploy", "ictus-rti", "ictusd"]),
+];
+
+/// Crates that may depend on tokio.
+const ASYNC: &[&str] = &["ictus-deploy", "ictusd", "ictus-cli"];
+
+/// Lines of code, tests not counted, that a file may have.
+const FILE_LINES_MAX: usize = 700;
+
+fn root() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).parent().unwrap().to_owned()
+}
+
+fn tracked(ending: &str) -> Vec<PathBuf> {
+    let output = Command::new("git")
+        .args(["ls-files", "--cached", "--others", "--exclude-standard"])
+        .current_dir(root())
+        .output()
+        .unwrap();
+    assert!(output.status.success(), "git ls-files");
+    let names = String::from_utf8(output.stdout).unwrap();
+    let paths = names.lines().filter(|name| name.ends_with(ending)).map(|name| root().join(name));
+    paths.filter(|path| path.exists()).collect()
+}
+
+fn metadata() -> Value {
+    let output = Command::new(env!("CARGO"))
+        .args(["metadata", "--format-version", "1", "--no-deps", "--offline"])
+        .current_dir(root())
+        .output()
+        .unwrap();
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    serde_json::from_slice(&output.stdout).unwrap()
+}
+
+/// The direct dependencies of a package, development ones left out.
+fn dependencies(package: &Value) -> BTreeSet<&str> {
+    let dependencies = package["dependencies"].as_array().unwrap().iter();
+    dependencies.filter(|d| d["kind"] != "dev").map(|d| d["name"].as_str().unwrap()).collect()
+}
+
+#[test]
+fn imports_follow_the_arrows() {
+    let metadata = metadata();
+    let ours: BTreeSet<&str> = ARROWS.iter().map(|(name, _)| *name).collect();
+    for package in metadata["packages"].as_array().unwrap() {
+        let name = package["name"].as_str().unwrap();
+        let Some((_, allowed)) = ARROWS.iter().find(|(known, _)| *known == name) else { continue };
+        for dependency in dependencies(package) {
+            assert!(
+                !ours.contains(dependency) || allowed.contains(&dependency),
+                "{name} may not import {dependency}: the arrows are in ARCHITECTURE.md"
+            );
+            assert!(dependency != "tokio" || ASYNC.contains(&name), "{name} may not use tokio");
+        }
+    }
+}
+
+#[test]
+fn every_crate_has_its_arrows() {
+    let metadata = metadata();
+    for package in metadata["packages"].as_array().unwrap() {
+        let name = package["name"].as_str().unwrap();
+        let ours = name == "ictus" || name.starts_with("ictus-") || name == "ictusd";
+        let known = name == "ictus-tests" || ARROWS.iter().any(|(known, _)| *known == name);
+        assert!(!ours || known, "{name} is missing in tests/tidy.rs");
+    }
+}
+
+/// Lines that are not blank, not comments and not in the test module at the end.
+fn code_lines(text: &str) -> usize {
+    let body = text.split("\n#[cfg(test)]\nmod tests {").next().unwrap();
+    let lines = body.lines().map(str::trim);
+    lines.filter(|line| !line.is_empty() && !line.starts_with("//")).count()
+}
+
+#[test]
+fn files_are_short() {
+    for path in tracked(".rs") {
+        let lines = code_lines(&fs::read_to_string(&path).unwrap());
+        assert!(
+            lines <= FILE_LINES_MAX,
+            "{} has {lines} lines of code, {FILE_LINES_MAX} are allowed: is there a second subject in it?",
+            path.display()
+        );
+    }
+}
+
+#[test]
+fn nothing_is_left_over() {
+    let marks = [["FIX", "ME"].concat(), ["TO", "DO:"].concat(), ["XX", "X:"].concat()];
+    for path in tracked(".rs").into_iter().chain(tracked(".md")).chain(tracked(".toml")) {
+        let text = fs::read_to_string(&path).unwrap();
+        for mark in &marks {
+            assert!(!text.contains(mark), "{} contains {mark}", path.display());
+        }
+    }
+}
+
+#[test]
+fn links_resolve() {
+    for path in tracked(".md") {
+        let text = fs::read_to_string(&path).unwrap();
+        for target in text.split("](").skip(1).filter_map(|rest| rest.split(')').next()) {
+            let file = target.split('#').next().unwrap();
+            if file.is_empty() || target.contains("://") {
+                continue;
+            }
+            let linked = path.parent().unwrap().join(file);
+            assert!(linked.exists(), "{}: link to {target} leads nowhere", path.display());
+        }
+    }
+}
+
+#[test]
+fn every_module_file_is_used() {
+    let sources = tracked(".rs");
+    let texts: Vec<String> = sources.iter().map(|p| fs::read_to_string(p).unwrap()).collect();
+    for path in &sources {
+        let stem = path.file_stem().unwrap().to_str().unwrap();
+        let root_file = ["lib", "main", "build"].contains(&stem)
+            || path.parent().is_some_and(|dir| dir.join("Cargo.toml").exists())
+            || path.parent().is_some_and(|dir| ["tests", "bin"].iter().any(|n| dir.ends_with(n)));
+        let declared = texts.iter().any(|text| text.contains(&format!("mod {stem};")));
+        assert!(root_file || declared, "{} is part of no crate", path.display());
+    }
+}
