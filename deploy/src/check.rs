@@ -4,11 +4,19 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use ictus_coord::plan::{ClockSync, Plan};
+use ictus_coord::plan::{ClockSync, Coordination, FORMAT, FederatePlan, Plan};
 use serde::{Deserialize, Serialize};
 
-use crate::problem::{Problem, Problems};
+use crate::document::{Node, SyntaxError, Value};
+use crate::federation::{self, Executables, Member, Origin, Workshop};
+use crate::manifest::{self, Manifest, TimeSpan};
+use crate::problem::{Place, Problem, Problems, Report};
 use crate::timing::TimingSpec;
+use crate::wiring::{self, Wire};
+use crate::{causality, lets, reactions, structure};
+
+/// The longest manifest that is read, in bytes.
+const MAX_MANIFEST: u64 = 1 << 20;
 
 /// How much [`check`] may do.
 #[derive(Clone, Debug)]
@@ -161,12 +169,250 @@ pub fn check(
     options: &CheckOptions,
     progress: &mut dyn FnMut(Progress),
 ) -> Result<Checked, Problems> {
-    let _ = (manifest, options, progress);
-    Err(Problems::default())
+    let text = match read(manifest) {
+        Ok(text) => text,
+        Err(error) => {
+            let mut report = Report::new(manifest, "");
+            report.add("F001", Place::key::<&str>(&[]), error, "");
+            return Err(report.finish().0);
+        }
+    };
+    let mut report = Report::new(manifest, &text);
+    let absolute = std::path::absolute(manifest).unwrap_or_else(|_| manifest.to_path_buf());
+    let checked = check_text(&text, &absolute, options, (&mut report, progress));
+    let (problems, warnings) = report.finish();
+    match checked {
+        Some(checked) if problems.0.is_empty() => Ok(Checked {
+            warnings,
+            ..checked
+        }),
+        Some(_) | None => Err(problems),
+    }
 }
 
 /// The JSON Schema of the manifest.
 #[must_use]
 pub fn schema() -> serde_json::Value {
-    serde_json::Value::Null
+    manifest::schema()
+}
+
+fn read(path: &Path) -> Result<String, String> {
+    let cannot = |error: std::io::Error| format!("cannot read the manifest: {error}");
+    let metadata = std::fs::metadata(path).map_err(cannot)?;
+    if metadata.is_dir() {
+        return Err("cannot read the manifest: it is a folder".to_owned());
+    }
+    if metadata.len() > MAX_MANIFEST {
+        return Err(format!("the manifest is longer than {MAX_MANIFEST} bytes"));
+    }
+    std::fs::read_to_string(path).map_err(cannot)
+}
+
+/// Checks a manifest's text; everything wrong is in the report. Absent when the text cannot be read at all.
+fn check_text(
+    text: &str,
+    absolute: &Path,
+    options: &CheckOptions,
+    (report, progress): (&mut Report, &mut dyn FnMut(Progress)),
+) -> Option<Checked> {
+    let manifest = form(text, options, report)?;
+    let mut members = federation::members(&manifest, report);
+    for member in members.iter_mut().filter(|member| member.is_foreign()) {
+        member.description = Some(federation::foreign_description(member.federate));
+    }
+    let dir = absolute.parent().unwrap_or(absolute);
+    let workshop = Workshop {
+        manifest: &manifest,
+        dir,
+        options,
+    };
+    let mut executables = Executables::default();
+    if options.build {
+        executables = workshop.build(&members, report, progress);
+        workshop.describe(&mut members, &executables, report, progress);
+    } else {
+        workshop.inspect(report);
+    }
+    let wires = wiring::wire(&manifest, &members, report);
+    causality::check(&members, &wires, report);
+    check_fast(&manifest, &members, report);
+    let timing = reactions::resolve(&manifest, &members, &wires, report);
+    Some(Checked {
+        manifest: absolute.to_path_buf(),
+        plan: plan(&manifest, &members, wires),
+        federates: runs(&members, &executables),
+        settings: settings(&manifest),
+        timing,
+        one_program: one_program(&members, &executables),
+        warnings: Vec::new(),
+    })
+}
+
+/// The manifest's form: YAML, `let`, keys and kinds of values.
+fn form(text: &str, options: &CheckOptions, report: &mut Report) -> Option<Manifest> {
+    let root = match Node::parse(text) {
+        Ok(root) => root,
+        Err(error) => {
+            let fix = syntax_fix(text, &error);
+            let place = Place::exact::<&str>(&[], error.site);
+            report.add("F001", place, error.message, fix);
+            return None;
+        }
+    };
+    report.set_root(root.clone());
+    if !matches!(root.value, Value::Map(_)) {
+        let message = format!("a manifest is a mapping, found {}", root.kind());
+        let fix = "start with `ictus: v1` and `federation: NAME`";
+        report.add("F005", Place::value::<&str>(&[]), message, fix);
+        return None;
+    }
+    let root = lets::substitute(&root, &options.overrides, report);
+    let root = structure::prune(&manifest::schema(), &root, report);
+    match Manifest::deserialize(&root) {
+        Ok(manifest) => Some(manifest),
+        Err(error) => {
+            report.add("F005", Place::value::<&str>(&[]), error.to_string(), "");
+            None
+        }
+    }
+}
+
+/// What most often stands behind an error of syntax.
+fn syntax_fix(text: &str, error: &SyntaxError) -> &'static str {
+    let row = usize::try_from(error.site.line)
+        .unwrap_or(0)
+        .saturating_sub(1);
+    let line = text.lines().nth(row).unwrap_or_default();
+    if error.message.contains("tab") {
+        return "indent with spaces";
+    }
+    let channel = line.split_once('[').is_some_and(|(before, after)| {
+        before.ends_with(|c: char| c.is_ascii_alphanumeric() || c == '_')
+            && after.starts_with(|c: char| c.is_ascii_digit())
+    });
+    if channel && error.message.contains("flow") {
+        return "quote a port with a channel: `\"federate.port[0]\"`";
+    }
+    if error.message.contains("did not find expected") {
+        return "look before this place for a bracket, brace or quote that is not closed";
+    }
+    ""
+}
+
+fn check_fast(manifest: &Manifest, members: &[Member<'_>], report: &mut Report) {
+    if !manifest.fast {
+        return;
+    }
+    let physical: Vec<&str> = members
+        .iter()
+        .filter(|member| {
+            member
+                .description
+                .as_ref()
+                .is_some_and(|known| known.physical)
+        })
+        .map(|member| member.name)
+        .collect();
+    if !physical.is_empty() {
+        let message = format!(
+            "`fast`, but `{}` has a physical action",
+            physical.join("`, `")
+        );
+        report.add(
+            "F019",
+            Place::value(&["fast"]),
+            message,
+            "remove `fast: true`",
+        );
+    }
+}
+
+fn plan(manifest: &Manifest, members: &[Member<'_>], wires: Vec<Wire>) -> Plan {
+    let federates = members.iter().map(|member| {
+        let (program, class) = match member.origin {
+            Origin::Ours { program, class } => (program, class),
+            Origin::Foreign { .. } => (None, None),
+        };
+        FederatePlan {
+            name: member.name.to_owned(),
+            class: class.map(str::to_owned),
+            program: program.map(str::to_owned),
+            parameters: federation::parameters(member.federate),
+        }
+    });
+    Plan {
+        ictus: FORMAT.to_owned(),
+        federation: manifest.federation.clone().unwrap_or_default(),
+        coordination: manifest.coordination.unwrap_or(Coordination::Centralized),
+        timeout_ns: manifest.timeout.map(|span| span.0),
+        fast: manifest.fast,
+        keepalive: manifest.keepalive,
+        max_lead_ns: manifest.max_lead.map(|span| span.0),
+        clock_sync: manifest.clock.sync,
+        extensions: true,
+        federates: federates.collect(),
+        connections: wires.into_iter().map(|wire| wire.plan).collect(),
+    }
+}
+
+fn runs(members: &[Member<'_>], executables: &Executables) -> Vec<FederateRun> {
+    let run = |(id, member): (u16, &Member<'_>)| {
+        let (executable, kind) = match member.origin {
+            Origin::Ours { program, .. } => {
+                (executables.programs.get(program?)?, FederateKind::Ours)
+            }
+            Origin::Foreign { .. } => {
+                let args = member.federate.args.clone();
+                (
+                    executables.foreign.get(member.name)?,
+                    FederateKind::Foreign { args },
+                )
+            }
+        };
+        let env = member.federate.env.0.iter();
+        Some(FederateRun {
+            id,
+            name: member.name.to_owned(),
+            executable: executable.clone(),
+            kind,
+            env: env
+                .map(|(name, value)| (name.clone(), value.to_string()))
+                .collect(),
+        })
+    };
+    (0_u16..).zip(members).filter_map(run).collect()
+}
+
+/// The one executable that has the class of every federate.
+fn one_program(members: &[Member<'_>], executables: &Executables) -> Option<PathBuf> {
+    let mut paths = members
+        .iter()
+        .map(|member| executables.programs.get(member.program()?));
+    let first = paths.next()??;
+    paths.all(|path| path == Some(first)).then(|| first.clone())
+}
+
+fn settings(manifest: &Manifest) -> Settings {
+    let basic = Settings::default();
+    let defaults = &manifest.defaults;
+    let span = |span: Option<TimeSpan>, otherwise: Duration| {
+        span.map_or(otherwise, |span| {
+            ictus_core::Duration::from_nanos(span.0).to_std()
+        })
+    };
+    let port = match manifest.rti.port {
+        Some(manifest::Port::Number(port)) => Some(port),
+        Some(manifest::Port::Word(_)) | None => None,
+    };
+    Settings {
+        rti_port: port,
+        join_timeout: span(defaults.join_timeout, basic.join_timeout),
+        stop_grace: span(defaults.stop_grace, basic.stop_grace),
+        log_max_size: defaults
+            .logs
+            .max_size
+            .map_or(basic.log_max_size, |size| size.0),
+        log_max_files: defaults.logs.max_files.unwrap_or(basic.log_max_files),
+        clock: manifest.clock.sync,
+    }
 }

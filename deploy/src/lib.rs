@@ -4,13 +4,26 @@
 //! [`Checked`] federation or every mistake at once ([`Problems`]). [`trace`] compares the logical
 //! traces of two runs; [`timing`] prints what a run's timing files say about order and latency.
 
+mod causality;
 pub mod check;
+mod codes;
+mod document;
+mod federation;
+mod lets;
+mod manifest;
 pub mod problem;
+mod program;
+mod quantity;
+mod reactions;
+mod structure;
+mod suggest;
 pub mod timing;
 pub mod trace;
+mod wiring;
 
 pub use check::{
     CheckOptions, Checked, FederateKind, FederateRun, Progress, Settings, check, schema,
 };
-pub use problem::{Problem, Problems, explain};
+pub use codes::explain;
+pub use problem::{Problem, Problems};
 pub use timing::TimingSpec;

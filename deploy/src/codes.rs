@@ -1,0 +1,163 @@
+//! The codes of problems and what they mean.
+
+/// Tells what a code means and what to do, in a paragraph; absent for an unknown code.
+#[must_use]
+pub fn explain(code: &str) -> Option<&'static str> {
+    CODES
+        .iter()
+        .find(|(have, _)| have.eq_ignore_ascii_case(code))
+        .map(|(_, text)| *text)
+}
+
+/// Every code, in order.
+pub(crate) const CODES: &[(&str, &str)] = &[
+    (
+        "F001",
+        "The file cannot be read, or is not YAML. The place is where the reader gave up; the \
+         mistake often stands a line before it: a missing colon, a bracket or quote that is not \
+         closed, a tab in the indentation.",
+    ),
+    (
+        "F002",
+        "A mapping has the same key twice, for example two federates of one name. YAML readers \
+         would silently keep one of them, so this is refused. Rename or remove one.",
+    ),
+    (
+        "F003",
+        "A key that the manifest does not know. Often a typing error, or a key at the wrong depth. \
+         `ictus schema` prints every key with its meaning.",
+    ),
+    (
+        "F004",
+        "A key that must be given is missing. `ictus schema` lists the required ones.",
+    ),
+    (
+        "F005",
+        "A value of the wrong kind, an unknown word, or a number out of range. A text that looks \
+         like a number or a boolean needs quotes: `\"10\"`.",
+    ),
+    (
+        "F006",
+        "A duration or size that cannot be read. Both need a unit, also for zero: `10 ms`, `0 s`, \
+         `10 MiB`. Units of time: ns, us, ms, s, min, h. Units of size: B, kB, KiB, MB, MiB, GB, \
+         GiB.",
+    ),
+    (
+        "F007",
+        "A value `$name` stands for the value of `let.name`, which `--set name=value` may replace. \
+         There is no such name in `let`. For a text that begins with a dollar sign, write `$$`.",
+    ),
+    (
+        "F008",
+        "Names of federations, programs, federates, ports and parameters are a letter followed by \
+         letters, digits, `_` or `-`, at most 64 in all: they become file names and parts of paths.",
+    ),
+    (
+        "F009",
+        "A federate names a program that `programs` does not have.",
+    ),
+    (
+        "F010",
+        "The program has no reactor class of that name. `PROGRAM --describe` lists its classes; a \
+         class must stand in the program's `ictus::program!` line.",
+    ),
+    (
+        "F011",
+        "A connection or report names a federate that `federates` does not have.",
+    ),
+    (
+        "F012",
+        "The federate's class has no port of that name. `PROGRAM --describe` lists ports; those of \
+         a foreign federate are the manifest's `ports`.",
+    ),
+    (
+        "F013",
+        "A connection leads from an output to an input. One of its ends is the other way round.",
+    ),
+    (
+        "F014",
+        "Two connected ports have different types. Types are equal when their declared name and \
+         their layout (field names, types and order) are equal.",
+    ),
+    (
+        "F015",
+        "An input, or a channel of it, has two connections. An input has at most one sender; give \
+         the receiver a multiport and connect each sender to a channel.",
+    ),
+    (
+        "F016",
+        "The serializer is unknown, or one of the ports does not offer it. `native` copies plain \
+         old data between our own federates and LF's; `postcard` needs serde on the type.",
+    ),
+    (
+        "F017",
+        "A channel is out of range, or multiports of different widths are connected as a whole. \
+         Name channels (`federate.port[2]`) or make the widths equal.",
+    ),
+    (
+        "F018",
+        "Values would have to pass around a loop without logical time passing: every connection of \
+         it has no `after`, and every federate on it reacts to its input at the same tag. Give one \
+         connection an `after`; `after: 0 s` is one microstep and enough.",
+    ),
+    (
+        "F019",
+        "`fast` runs ahead of physical time, but a federate has a physical action, whose events \
+         come at physical times. Remove `fast`, or the physical action.",
+    ),
+    (
+        "F020",
+        "The ids of foreign federates are compiled in. They must differ, and lie below the number \
+         of federates; our own federates take the ids that are left.",
+    ),
+    (
+        "F021",
+        "A program cannot be built. The compiler's first error is shown; `cargo build` in the \
+         package's folder shows all.",
+    ),
+    (
+        "F022",
+        "A program was asked what it consists of (`PROGRAM --describe`) and did not answer: it \
+         crashed, took too long, or printed something else. It runs with a closed standard input, \
+         an environment of PATH and HOME only, a time limit and an output limit.",
+    ),
+    ("F023", "A federation has at least one federate."),
+    (
+        "F024",
+        "The class does not have such a parameter, needs one that is not given, or does not accept \
+         its value.",
+    ),
+    (
+        "F025",
+        "A federate is either ours (`program` and `class`) or foreign (`binary`, `id` and \
+         `ports`), never both.",
+    ),
+    (
+        "F026",
+        "The `timing` section names a reaction that does not exist, or a chain whose steps no \
+         connection joins. Reactions are named `federate.reaction`, or `federate.reactor.reaction` \
+         for one of a contained reactor.",
+    ),
+    (
+        "F027",
+        "A program is either a cargo package (`package`) or an executable that exists (`binary`); \
+         paths are relative to the manifest.",
+    ),
+    (
+        "W001",
+        "No connection leads to an input, so its reactions will not run.",
+    ),
+    ("W002", "Nothing uses this name."),
+];
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn codes_are_sorted_and_explained() {
+        assert!(CODES.windows(2).all(|pair| pair[0].0 < pair[1].0));
+        assert!(explain("f012").is_some_and(|text| text.contains("port")));
+        assert_eq!(explain("F999"), None);
+    }
+}

@@ -1,0 +1,251 @@
+//! `check` from the outside: manifests against a program that describes itself, and a corpus of bad ones.
+#![allow(
+    clippy::unwrap_used,
+    clippy::panic,
+    missing_docs,
+    reason = "tests may fail loudly"
+)]
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use ictus_deploy::{CheckOptions, Checked, FederateKind, Problems, check};
+
+/// A folder with a manifest and `bin/NAME` for every name the fake program knows.
+struct Bench {
+    dir: tempfile::TempDir,
+}
+
+impl Bench {
+    fn new(manifest: &str) -> Self {
+        let dir = tempfile::tempdir().unwrap();
+        fs::write(dir.path().join("federation.yaml"), manifest).unwrap();
+        fs::create_dir(dir.path().join("bin")).unwrap();
+        let names = [
+            "fake", "tools", "camera", "hang", "crash", "garbage", "flood", "old", "short",
+        ];
+        let first = dir.path().join("bin/fake");
+        for name in names {
+            let path = dir.path().join("bin").join(name);
+            // A link, not a copy: it has a name of its own and costs nothing.
+            if name == "fake" {
+                fs::copy(fake_program(), &path).unwrap();
+            } else {
+                fs::hard_link(&first, &path).unwrap();
+            }
+        }
+        Self { dir }
+    }
+
+    fn check(&self, options: &CheckOptions) -> Result<Checked, Problems> {
+        check(
+            &self.dir.path().join("federation.yaml"),
+            options,
+            &mut |_| {},
+        )
+    }
+
+    /// What a person sees, with the folder taken out.
+    fn shown(&self, options: &CheckOptions) -> String {
+        let text = match self.check(options) {
+            Ok(checked) => {
+                let warnings: Vec<String> =
+                    checked.warnings.iter().map(ToString::to_string).collect();
+                format!("no mistake\n{}", warnings.join("\n\n"))
+            }
+            Err(problems) => problems.to_string(),
+        };
+        let dir = self.dir.path().display().to_string();
+        text.replace(&format!("{dir}/./"), "")
+            .replace(&format!("{dir}/"), "")
+            + "\n"
+    }
+}
+
+/// The example `fake_program`, which cargo builds beside the tests.
+fn fake_program() -> PathBuf {
+    let test = std::env::current_exe().unwrap();
+    let profile = test.parent().unwrap().parent().unwrap();
+    profile.join("examples/fake_program")
+}
+
+fn testdata() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("testdata")
+}
+
+/// The example of every key, with a program of ours in place of the cargo package.
+fn example() -> String {
+    let text = fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join("example.yaml"));
+    let text = text.unwrap();
+    let changed = text.replace("{ package: ./acc, bin: acc }", "{ binary: bin/fake }");
+    assert_ne!(text, changed);
+    changed
+}
+
+#[test]
+fn the_example_is_a_federation() {
+    let bench = Bench::new(&example());
+    let checked = bench
+        .check(&CheckOptions::default())
+        .unwrap_or_else(|p| panic!("{p}"));
+    let plan = &checked.plan;
+    let names: Vec<&str> = plan
+        .federates
+        .iter()
+        .map(|federate| federate.name.as_str())
+        .collect();
+    assert_eq!(names, ["radar", "planner", "logger", "camera"]);
+    assert_eq!(plan.timeout_ns, Some(10_000_000_000));
+    assert!(plan.extensions);
+    let wires: Vec<String> = plan
+        .connections
+        .iter()
+        .map(|wire| {
+            format!(
+                "{}.{}[{}] -> {}.{}[{}] after {:?} {} #{}",
+                wire.from.federate,
+                wire.from.port,
+                wire.from.channel,
+                wire.to.federate,
+                wire.to.port,
+                wire.to.channel,
+                wire.after_ns,
+                wire.serializer,
+                wire.port_id
+            )
+        })
+        .collect();
+    assert_eq!(
+        wires,
+        [
+            "0.object[0] -> 1.object[0] after Some(5000000) postcard #0",
+            "1.command[0] -> 2.command[0] after None native #0",
+            "1.command[0] -> 2.copy[0] after None native #1",
+            "1.wish[0] -> 3.trigger[0] after Some(0) native #0",
+            "3.frame[0] -> 1.frame[0] after None native #4",
+            "0.points[0] -> 2.points[0] after None postcard #2",
+            "0.points[1] -> 2.points[1] after None postcard #3",
+        ]
+    );
+    assert_eq!(checked.one_program, None);
+    assert_eq!(
+        checked.federates[3].kind,
+        FederateKind::Foreign {
+            args: vec!["-x".into()]
+        }
+    );
+    assert_eq!(checked.federates[0].env["RUST_LOG"], "info");
+    assert_eq!(plan.federates[0].parameters["seed"], 7);
+    let chain = &checked.timing.end_to_end[0];
+    assert_eq!(
+        (chain.source.path.as_str(), chain.source.index),
+        ("radar", 0)
+    );
+    let hops: Vec<_> = chain
+        .hops
+        .iter()
+        .map(|hop| {
+            (
+                hop.delay_ns,
+                hop.delay_microsteps,
+                hop.sampled,
+                hop.reactions.len(),
+            )
+        })
+        .collect();
+    assert_eq!(hops, [(5_000_000, 0, true, 1), (0, 0, false, 2)]);
+}
+
+#[test]
+fn let_values_can_be_overridden() {
+    let bench = Bench::new(&example());
+    let mut options = CheckOptions::default();
+    options.overrides.insert("half".into(), "0 ms".into());
+    let checked = bench.check(&options).unwrap_or_else(|p| panic!("{p}"));
+    assert_eq!(checked.plan.connections[0].after_ns, Some(0));
+    options.overrides.insert("hafl".into(), "0 ms".into());
+    let shown = bench.shown(&options);
+    assert!(shown.contains("did you mean `half`?"), "{shown}");
+}
+
+#[test]
+fn without_build_nothing_runs() {
+    let bench = Bench::new(&example().replace("bin/fake", "bin/hang"));
+    let options = CheckOptions {
+        build: false,
+        ..CheckOptions::default()
+    };
+    let checked = bench.check(&options).unwrap_or_else(|p| panic!("{p}"));
+    assert!(checked.federates.is_empty());
+    assert_eq!(checked.plan.federates.len(), 4);
+}
+
+/// Every `testdata/bad/NAME.yaml` gives the text of `NAME.txt`; `UPDATE=1` writes it anew.
+#[test]
+fn bad_manifests_are_explained() {
+    let options = CheckOptions {
+        describe_timeout: Duration::from_millis(1500),
+        ..CheckOptions::default()
+    };
+    let mut paths: Vec<PathBuf> = fs::read_dir(testdata().join("bad"))
+        .unwrap()
+        .map(|entry| entry.unwrap().path())
+        .filter(|path| {
+            path.extension()
+                .is_some_and(|extension| extension == "yaml")
+        })
+        .collect();
+    paths.sort();
+    assert!(paths.len() >= 20);
+    let mut wrong = String::new();
+    for path in paths {
+        let shown = Bench::new(&fs::read_to_string(&path).unwrap()).shown(&options);
+        let golden = path.with_extension("txt");
+        if std::env::var_os("UPDATE").is_some() {
+            fs::write(&golden, &shown).unwrap();
+        } else if fs::read_to_string(&golden).unwrap_or_default() != shown {
+            wrong.push_str(&format!("=== {}\n{shown}\n", golden.display()));
+        }
+    }
+    assert!(wrong.is_empty(), "{wrong}\nUPDATE=1 accepts what is shown");
+}
+
+/// A cargo package without dependencies, so that building it takes a second.
+fn package(bench: &Bench, main: &str) {
+    let dir = bench.dir.path().join("broken");
+    fs::create_dir_all(dir.join("src")).unwrap();
+    let manifest = "[package]\nname = \"broken\"\nedition = \"2024\"\n[workspace]\n";
+    fs::write(dir.join("Cargo.toml"), manifest).unwrap();
+    fs::write(dir.join("src/main.rs"), main).unwrap();
+}
+
+#[test]
+fn a_program_that_does_not_build_shows_its_first_error() {
+    let bench = Bench::new(
+        "ictus: v1\nfederation: bad\nprograms: { broken: { package: broken } }\n\
+         federates: { a: { class: Relay } }\n",
+    );
+    package(&bench, "fn main() { one(); two(); }\n");
+    let target_dir = Some(bench.dir.path().join("target"));
+    let options = CheckOptions {
+        target_dir,
+        release: false,
+        ..CheckOptions::default()
+    };
+    let shown = bench.shown(&options);
+    assert!(
+        shown.starts_with("federation.yaml:3:13: program `broken` cannot be built"),
+        "{shown}"
+    );
+    assert!(shown.contains("cannot find function `one`"), "{shown}");
+    assert!(!shown.contains("cannot find function `two`"), "{shown}");
+
+    package(&bench, "fn main() { println!(\"hello\"); }\n");
+    let shown = bench.shown(&options);
+    assert!(shown.contains("the output begins with `hello"), "{shown}");
+
+    fs::write(bench.dir.path().join("broken/Cargo.toml"), "[package\n").unwrap();
+    let shown = bench.shown(&options);
+    assert!(shown.contains("cannot be built: error: "), "{shown}");
+}
