@@ -377,8 +377,7 @@ impl Federate {
         if self.config.keepalive || self.physical_delay.is_some() {
             return None;
         }
-        let stop = self.timeline.at().next_microstep()?;
-        self.timeline.stop_at(stop);
+        self.timeline.stop_at(self.timeline.at().successor());
         Some(self.timeline.stop_tag())
     }
 

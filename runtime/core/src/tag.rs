@@ -145,6 +145,20 @@ impl Tag {
         }
     }
 
+    /// Returns the least tag after this one: the inverse of [`Tag::latest_earlier`]. NEVER and FOREVER are left alone.
+    #[must_use]
+    pub const fn successor(self) -> Self {
+        match self.next_microstep() {
+            Some(tag) => tag,
+            None if self.microstep == u32::MAX && self.time.as_nanos() != i64::MAX => Self {
+                time: self.time,
+                microstep: 0,
+            }
+            .delayed(Delay::Time(Duration::from_nanos(1))),
+            None => self,
+        }
+    }
+
     /// Adds a path delay given as a tag; the later connection of a path is the argument.
     ///
     /// NEVER absorbs, then FOREVER; a positive time in `path` drops this tag's microstep. Not commutative.
@@ -228,6 +242,7 @@ mod tests {
             prop_assume!(a != Tag::NEVER && a != Tag::FOREVER);
             let before = a.latest_earlier();
             prop_assert!(before < a);
+            prop_assert_eq!(before.successor(), a);
             prop_assert!(!(before < b && b < a));
         }
 

@@ -177,7 +177,7 @@ impl Timeline {
 
     /// Makes the stop tag earlier (a stop was agreed); never later, and never at or before a completed tag.
     pub fn stop_at(&mut self, stop: Tag) {
-        let floor = self.at.next_microstep().unwrap_or(Tag::FOREVER);
+        let floor = self.at.successor();
         self.stop = self.stop.min(stop.max(floor));
     }
 
@@ -437,7 +437,7 @@ impl Timeline {
             unreachable!("only physical actions are scheduled from outside")
         };
         let wanted = Tag::new(stamp.saturating_add(min_delay).as_logical(), 0);
-        let after_current = self.at.next_microstep().unwrap_or(Tag::FOREVER);
+        let after_current = self.at.successor();
         let last = self.latest[action.index()];
         let spaced = match min_spacing {
             Duration::ZERO => last.next_microstep().unwrap_or(Tag::NEVER),
@@ -475,7 +475,7 @@ impl Timeline {
             self.fire(&program, action);
             return Admission::IntoCurrentTag;
         }
-        let next = self.at.next_microstep().unwrap_or(Tag::FOREVER);
+        let next = self.at.successor();
         let actual = self.enqueue(next, action, value);
         Admission::Tardy {
             intended: tag,

@@ -153,5 +153,5 @@ impl Federate {
 }
 
 fn after(timeline: &Timeline) -> Tag {
-    timeline.at().next_microstep().unwrap_or(Tag::FOREVER)
+    timeline.at().successor()
 }
