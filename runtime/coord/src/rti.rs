@@ -271,7 +271,10 @@ struct Member {
     listener: Option<i32>,
     /// Tags of messages on their way to it and not covered by its LTC: ascending, distinct.
     in_transit: VecDeque<Tag>,
-    last_dnet: Tag,
+    /// The last DNET sent to it.
+    sent_dnet: Tag,
+    /// As far as it follows that DNET: it lowers it itself when it sends a message with an earlier tag.
+    known_dnet: Tag,
     last_downstream_confirmed: Tag,
     /// Up to here nothing can happen there any more; never falls.
     confirmed: Tag,
@@ -538,7 +541,8 @@ impl Member {
             },
             listener: None,
             in_transit: VecDeque::new(),
-            last_dnet: Tag::NEVER,
+            sent_dnet: Tag::NEVER,
+            known_dnet: Tag::NEVER,
             last_downstream_confirmed: Tag::NEVER,
             confirmed: Tag::NEVER,
         }

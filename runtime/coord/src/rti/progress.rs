@@ -207,8 +207,9 @@ impl Rti {
         let tag = downstream_next_event(&self.view(LostRule::Gone, start), federate);
         let announced = self.standings[federate.index()].next_event;
         let member = &mut self.members[federate.index()];
-        if tag != member.last_dnet && announced <= tag {
-            member.last_dnet = tag;
+        if announced <= tag && (tag != member.sent_dnet || tag > member.known_dnet) {
+            member.sent_dnet = tag;
+            member.known_dnet = tag;
             self.send(federate, &ToFederate::DownstreamNextEventTag(tag));
         }
     }

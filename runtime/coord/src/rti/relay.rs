@@ -37,6 +37,8 @@ impl Rti {
             Ok(Some((message, consumed))) => {
                 if usize::from(message.federate) < self.members.len() {
                     let to = FederateId::new(message.federate);
+                    let known_dnet = &mut self.members[from.index()].known_dnet;
+                    *known_dnet = message.tag.min(*known_dnet);
                     self.relay_message(to, message.tag, &bytes[..consumed]);
                 } else {
                     self.fail(from, format!("it sends to federate {}", message.federate));
