@@ -1,10 +1,21 @@
 //! The per-host agent: supervises federates and the RTI, serves the API.
+//!
+//! - [`supervisor`]: one small process per federate, which outlives the daemon;
+//! - [`agent`]: what to do next, as a state machine without I/O;
+//! - [`daemon`]: the process that owns federations and serves [`api`] on a Unix socket;
+//! - [`client`]: what the command line uses.
 
 pub mod agent;
 pub mod api;
+pub mod client;
+pub mod daemon;
+mod federation;
 mod files;
+mod host;
 pub mod identity;
+pub mod logs;
 pub mod paths;
+mod server;
 pub mod stamp;
 pub mod store;
 pub mod supervisor;

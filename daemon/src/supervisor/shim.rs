@@ -10,6 +10,7 @@ use std::io::{self, Write};
 use std::os::unix::process::CommandExt;
 use std::process::{Command, ExitCode, Stdio};
 
+use super::process;
 use rustix::process::{Signal, getppid, set_parent_process_death_signal};
 
 /// The command's name: `ictus supervise-exec SUPERVISOR_PID PROGRAM ARGS...`.
@@ -30,7 +31,11 @@ pub fn exec(mut args: impl Iterator<Item = OsString>) -> ExitCode {
     let error = match set_parent_process_death_signal(Some(Signal::KILL)) {
         // A supervisor that died before the call sends no signal any more.
         Ok(()) if getppid().map(|pid| pid.as_raw_nonzero().get()) == Some(supervisor) => {
-            Command::new(program).args(args).stdin(Stdio::null()).exec()
+            let mut command = Command::new(&program);
+            if program == process::own_executable() {
+                command.arg0("ictus");
+            }
+            command.args(args).stdin(Stdio::null()).exec()
         }
         Ok(()) => return ExitCode::FAILURE,
         Err(error) => error.into(),

@@ -1,0 +1,415 @@
+//! A client of the daemon: what the command line uses.
+
+use std::ffi::OsStr;
+use std::fs::OpenOptions;
+use std::io;
+use std::marker::PhantomData;
+use std::path::{Path, PathBuf};
+use std::process::Stdio;
+use std::time::Duration;
+
+use http_body_util::{BodyExt, Full, Limited};
+use hyper::body::{Bytes, Incoming};
+use hyper::client::conn::http1;
+use hyper::{Method, Response, StatusCode};
+use hyper_util::rt::TokioIo;
+use serde::de::DeserializeOwned;
+use tokio::io::{AsyncBufReadExt, BufReader};
+use tokio::net::UnixStream;
+use tokio::task::JoinHandle;
+use tokio::time::timeout;
+
+use crate::api::{
+    ApiError, ErrorCode, FederationView, Happening, Info, LogLine, Removed, StartRequest,
+};
+use crate::daemon::READY;
+use crate::paths::{Paths, PathsError};
+
+/// How long a daemon may take to serve after it was started.
+const START_MAX: Duration = Duration::from_secs(15);
+/// The largest answer that is not a stream.
+const ANSWER_BYTES_MAX: usize = 64 << 20;
+/// The longest line of a stream.
+const LINE_BYTES_MAX: usize = 1 << 20;
+
+/// A way to the daemon; each request has a connection of its own.
+#[derive(Clone, Debug)]
+pub struct Client {
+    socket: PathBuf,
+}
+
+/// Why a request failed.
+#[derive(Debug, thiserror::Error)]
+pub enum ClientError {
+    /// There is no place for a daemon.
+    #[error(transparent)]
+    Paths(#[from] PathsError),
+    /// The daemon could not be started.
+    #[error("the daemon does not start: {why}")]
+    NotStarted {
+        /// The last lines of its log.
+        why: String,
+        /// Its log.
+        log: PathBuf,
+    },
+    /// The daemon is not there, or went away.
+    #[error("no connection to the daemon at {socket}", socket = socket.display())]
+    Unreachable {
+        /// Its socket.
+        socket: PathBuf,
+        /// Why.
+        source: io::Error,
+    },
+    /// The connection broke.
+    #[error("the connection to the daemon broke")]
+    Broken(#[source] hyper::Error),
+    /// The daemon said no.
+    #[error("{}", .0.message)]
+    Refused(ApiError),
+    /// The daemon said something that this version does not understand.
+    #[error("the daemon's answer is not understood; is it of another version?")]
+    NotUnderstood(#[source] serde_json::Error),
+    /// The daemon's answer is larger than any it should give.
+    #[error("the daemon's answer is too large")]
+    TooLarge,
+}
+
+impl ClientError {
+    /// Why the daemon said no; absent when it did not.
+    #[must_use]
+    pub fn refusal(&self) -> Option<&ApiError> {
+        match self {
+            Self::Refused(error) => Some(error),
+            Self::Paths(_)
+            | Self::NotStarted { .. }
+            | Self::Unreachable { .. }
+            | Self::Broken(_)
+            | Self::NotUnderstood(_)
+            | Self::TooLarge => None,
+        }
+    }
+}
+
+impl Client {
+    /// Finds the daemon that serves; absent when there is none.
+    pub async fn find(paths: &Paths) -> Option<Self> {
+        let client = Self {
+            socket: paths.socket(),
+        };
+        client.info().await.is_ok().then_some(client)
+    }
+
+    /// Finds the daemon, or starts `EXECUTABLE daemon` and waits until it serves.
+    ///
+    /// # Errors
+    /// When it does not serve in time; the message has its own words.
+    pub async fn find_or_start(paths: &Paths, executable: &Path) -> Result<Self, ClientError> {
+        if let Some(client) = Self::find(paths).await {
+            return Ok(client);
+        }
+        paths.create()?;
+        let log = paths.daemon_log();
+        let failed = |why: String| ClientError::NotStarted {
+            why,
+            log: paths.daemon_log(),
+        };
+        let file = OpenOptions::new().append(true).create(true).open(&log);
+        let file = file.map_err(|error| failed(error.to_string()))?;
+        let length_before = file.metadata().map_or(0, |found| found.len());
+        let mut command = tokio::process::Command::new(executable);
+        command
+            .arg("daemon")
+            .stdin(Stdio::null())
+            .stdout(Stdio::piped())
+            .stderr(file);
+        let mut child = command.spawn().map_err(|error| failed(error.to_string()))?;
+        let out = child
+            .stdout
+            .take()
+            .ok_or_else(|| failed("no standard output".to_owned()))?;
+        let mut line = String::new();
+        let mut out = BufReader::new(out);
+        let read = timeout(START_MAX, out.read_line(&mut line)).await;
+        if !matches!(read, Ok(Ok(_))) || line.trim_end() != READY {
+            let log = std::fs::read(&log).unwrap_or_default();
+            let new = log
+                .get(usize::try_from(length_before).unwrap_or(0)..)
+                .unwrap_or_default();
+            return Err(failed(String::from_utf8_lossy(new).trim().to_owned()));
+        }
+        Ok(Self {
+            socket: paths.socket(),
+        })
+    }
+
+    /// Asks who answers.
+    ///
+    /// # Errors
+    /// See [`ClientError`].
+    pub async fn info(&self) -> Result<Info, ClientError> {
+        self.answer(Method::GET, "/v1/info", Bytes::new()).await
+    }
+
+    /// Every federation that lives or has ended and was not taken down.
+    ///
+    /// # Errors
+    /// See [`ClientError`].
+    pub async fn federations(&self) -> Result<Vec<FederationView>, ClientError> {
+        self.answer(Method::GET, "/v1/federations", Bytes::new())
+            .await
+    }
+
+    /// One federation.
+    ///
+    /// # Errors
+    /// See [`ClientError`].
+    pub async fn federation(&self, name: &str) -> Result<FederationView, ClientError> {
+        self.answer(Method::GET, &path(name, "", &[]), Bytes::new())
+            .await
+    }
+
+    /// Starts a federation. Dropping the stream before `healthy` undoes it.
+    ///
+    /// # Errors
+    /// See [`ClientError`]; a federation of that name that runs is [`ErrorCode::AlreadyRunning`] or
+    /// [`ErrorCode::Conflict`].
+    pub async fn start(
+        &self,
+        name: &str,
+        request: &StartRequest,
+    ) -> Result<Stream<Happening>, ClientError> {
+        let body = serde_json::to_vec(request).map_err(ClientError::NotUnderstood)?;
+        self.stream(Method::POST, &path(name, "", &[]), body.into())
+            .await
+    }
+
+    /// Stops a federation in order, or kills it; the stream ends with its end.
+    ///
+    /// # Errors
+    /// See [`ClientError`].
+    pub async fn stop(&self, name: &str, kill: bool) -> Result<Stream<Happening>, ClientError> {
+        let kill = kill.to_string();
+        let path = path(name, "/stop", &[("kill", &kill)]);
+        self.stream(Method::POST, &path, Bytes::new()).await
+    }
+
+    /// Stops a federation if it runs and removes what it left.
+    ///
+    /// # Errors
+    /// See [`ClientError`].
+    pub async fn remove(&self, name: &str, purge: bool) -> Result<Removed, ClientError> {
+        let purge = purge.to_string();
+        self.answer(
+            Method::DELETE,
+            &path(name, "", &[("purge", &purge)]),
+            Bytes::new(),
+        )
+        .await
+    }
+
+    /// The logs of some federates, or of everybody when none is given.
+    ///
+    /// # Errors
+    /// See [`ClientError`].
+    pub async fn logs(
+        &self,
+        name: &str,
+        members: &[String],
+        follow: bool,
+        tail: Option<usize>,
+    ) -> Result<Stream<LogLine>, ClientError> {
+        let (members, follow) = (members.join(","), follow.to_string());
+        let mut query = vec![("federate", members.as_str()), ("follow", &follow)];
+        let tail = tail.map(|tail| tail.to_string());
+        query.extend(tail.as_deref().map(|tail| ("tail", tail)));
+        self.stream(Method::GET, &path(name, "/logs", &query), Bytes::new())
+            .await
+    }
+
+    /// Events kept, and with `follow` those that come.
+    ///
+    /// # Errors
+    /// See [`ClientError`].
+    pub async fn events(
+        &self,
+        name: Option<&str>,
+        follow: bool,
+    ) -> Result<Stream<Happening>, ClientError> {
+        let follow = follow.to_string();
+        let mut query = vec![("follow", follow.as_str())];
+        query.extend(name.map(|name| ("federation", name)));
+        let path = format!("/v1/events?{}", encode(&query));
+        self.stream(Method::GET, &path, Bytes::new()).await
+    }
+
+    /// Ends the daemon if it owns nothing; tells whether it does.
+    ///
+    /// # Errors
+    /// See [`ClientError`].
+    pub async fn end(&self) -> Result<bool, ClientError> {
+        self.answer(Method::POST, "/v1/end", Bytes::new()).await
+    }
+
+    async fn answer<T: DeserializeOwned>(
+        &self,
+        method: Method,
+        path: &str,
+        body: Bytes,
+    ) -> Result<T, ClientError> {
+        let (response, _connection) = self.send(method, path, body).await?;
+        let bytes = whole(response).await?;
+        serde_json::from_slice(&bytes).map_err(ClientError::NotUnderstood)
+    }
+
+    async fn stream<T: DeserializeOwned>(
+        &self,
+        method: Method,
+        path: &str,
+        body: Bytes,
+    ) -> Result<Stream<T>, ClientError> {
+        let (response, connection) = self.send(method, path, body).await?;
+        let (body, buffer) = (response.into_body(), Vec::new());
+        Ok(Stream {
+            body,
+            buffer,
+            _connection: connection,
+            item: PhantomData,
+        })
+    }
+
+    async fn send(
+        &self,
+        method: Method,
+        path: &str,
+        body: Bytes,
+    ) -> Result<(Response<Incoming>, Connection), ClientError> {
+        let unreachable = |source| ClientError::Unreachable {
+            socket: self.socket.clone(),
+            source,
+        };
+        let stream = UnixStream::connect(&self.socket)
+            .await
+            .map_err(unreachable)?;
+        let io = TokioIo::new(stream);
+        let (mut sender, connection) = http1::handshake(io).await.map_err(ClientError::Broken)?;
+        let connection = Connection(tokio::spawn(async move {
+            // What breaks is seen where the answer is read.
+            connection.await.ok();
+        }));
+        let request = hyper::Request::builder()
+            .method(method)
+            .uri(path)
+            .header("host", "ictusd")
+            .body(Full::new(body))
+            .map_err(|error| unreachable(io::Error::other(error)))?;
+        let response = sender
+            .send_request(request)
+            .await
+            .map_err(ClientError::Broken)?;
+        if response.status() == StatusCode::OK {
+            return Ok((response, connection));
+        }
+        let bytes = whole(response).await?;
+        let error: ApiError = serde_json::from_slice(&bytes).map_err(ClientError::NotUnderstood)?;
+        Err(ClientError::Refused(error))
+    }
+}
+
+/// Whether a refusal says that the federation runs from the very same plan.
+#[must_use]
+pub fn is_already_running(error: &ClientError) -> bool {
+    error
+        .refusal()
+        .is_some_and(|refusal| refusal.code == ErrorCode::AlreadyRunning)
+}
+
+/// A stream of JSON values; dropping it closes the connection.
+#[derive(Debug)]
+pub struct Stream<T> {
+    body: Incoming,
+    buffer: Vec<u8>,
+    _connection: Connection,
+    item: PhantomData<T>,
+}
+
+/// The task that drives a connection: it ends with what uses it.
+#[derive(Debug)]
+struct Connection(JoinHandle<()>);
+
+impl Drop for Connection {
+    fn drop(&mut self) {
+        self.0.abort();
+    }
+}
+
+impl<T: DeserializeOwned> Stream<T> {
+    /// The next value; absent at the end.
+    ///
+    /// # Errors
+    /// When the connection breaks or the daemon says something strange.
+    pub async fn next(&mut self) -> Result<Option<T>, ClientError> {
+        loop {
+            if let Some(end) = self.buffer.iter().position(|byte| *byte == b'\n') {
+                let line: Vec<u8> = self.buffer.drain(..=end).collect();
+                let value = serde_json::from_slice(&line).map_err(ClientError::NotUnderstood)?;
+                return Ok(Some(value));
+            }
+            if self.buffer.len() > LINE_BYTES_MAX {
+                return Err(ClientError::TooLarge);
+            }
+            let Some(frame) = self.body.frame().await else {
+                return Ok(None);
+            };
+            let frame = frame.map_err(ClientError::Broken)?;
+            if let Ok(data) = frame.into_data() {
+                self.buffer.extend_from_slice(&data);
+            }
+        }
+    }
+}
+
+async fn whole(response: Response<Incoming>) -> Result<Bytes, ClientError> {
+    let body = Limited::new(response.into_body(), ANSWER_BYTES_MAX);
+    match body.collect().await {
+        Ok(collected) => Ok(collected.to_bytes()),
+        Err(error) => match error.downcast::<hyper::Error>() {
+            Ok(error) => Err(ClientError::Broken(*error)),
+            Err(_) => Err(ClientError::TooLarge),
+        },
+    }
+}
+
+fn path(name: &str, call: &str, query: &[(&str, &str)]) -> String {
+    let name = escape(name);
+    format!("/v1/federations/{name}{call}?{}", encode(query))
+}
+
+fn encode(query: &[(&str, &str)]) -> String {
+    let pairs = query
+        .iter()
+        .map(|(key, value)| format!("{key}={}", escape(value)));
+    pairs.collect::<Vec<_>>().join("&")
+}
+
+/// Percent-encodes what is not plainly allowed in a path or query.
+fn escape(text: &str) -> String {
+    let mut escaped = String::new();
+    for byte in OsStr::new(text).as_encoded_bytes() {
+        if byte.is_ascii_alphanumeric() || b"-_.,".contains(byte) {
+            escaped.push(char::from(*byte));
+        } else {
+            escaped.push_str(&format!("%{byte:02X}"));
+        }
+    }
+    escaped
+}
+
+#[cfg(test)]
+mod tests {
+    use super::escape;
+
+    #[test]
+    fn strange_names_stay_one_path_segment() {
+        assert_eq!(escape("a/../b c"), "a%2F..%2Fb%20c");
+    }
+}

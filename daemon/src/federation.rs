@@ -1,0 +1,387 @@
+//! The driver of one federation: moves what supervisors say into the [`Agent`] and carries out its actions.
+
+use std::collections::BTreeMap;
+use std::io;
+
+use tokio::sync::{broadcast, mpsc, watch};
+use tokio::time::{Instant, sleep_until};
+
+use crate::agent::{Action, Agent, MemberId, Now, RTI};
+use crate::api::{Event, FederationView, Happening, MemberView, Outcome, StartRequest, State};
+use crate::identity::random_id;
+use crate::paths::Paths;
+use crate::stamp;
+use crate::store::{Directory, Record, StoreError, Supervised};
+use crate::supervisor::log_path;
+use crate::supervisor::protocol::StopSignal;
+use crate::supervisor::spec::PROTOCOL;
+
+mod launch;
+mod link;
+
+use link::{Heard, Link, Origin};
+
+/// Commands and supervisors' words waiting for the driver.
+const QUEUE_MAX: usize = 256;
+/// Signals waiting for a supervisor's link: at most one SIGTERM and one SIGKILL per rung of the ladder.
+const SIGNALS_MAX: usize = 16;
+
+/// What a client may ask of a federation.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Command {
+    /// Stop in order.
+    Stop,
+    /// End at once.
+    Kill,
+    /// Who asked for the start is gone.
+    StarterGone,
+}
+
+/// The way to a federation that lives.
+#[derive(Clone, Debug)]
+pub(crate) struct Handle {
+    pub(crate) request: StartRequest,
+    pub(crate) commands: mpsc::Sender<Command>,
+    pub(crate) view: watch::Receiver<FederationView>,
+}
+
+/// Why a federation could not be begun.
+#[derive(Debug, thiserror::Error)]
+pub(crate) enum BeginError {
+    /// The disk does not take its records.
+    #[error(transparent)]
+    Store(#[from] StoreError),
+    /// No random numbers.
+    #[error("cannot make a random id")]
+    Random(#[source] io::Error),
+}
+
+/// The driver's state; one task owns it.
+#[derive(Debug)]
+pub(crate) struct Federation {
+    paths: Paths,
+    directory: Directory,
+    request: StartRequest,
+    agent: Agent,
+    record: Record,
+    links: BTreeMap<MemberId, mpsc::Sender<StopSignal>>,
+    heard: mpsc::Receiver<Heard>,
+    hear: mpsc::Sender<Heard>,
+    commands: mpsc::Receiver<Command>,
+    view: watch::Sender<FederationView>,
+    told: broadcast::Sender<Happening>,
+    /// Events up to here were told by an earlier daemon.
+    told_until_ns: i64,
+    /// When what is being handled happened.
+    at_ns: i64,
+    origin: Instant,
+}
+
+impl Federation {
+    /// Clears the disk for a new run and begins it.
+    pub(crate) fn start(
+        paths: &Paths,
+        name: &str,
+        request: StartRequest,
+        told: broadcast::Sender<Happening>,
+    ) -> Result<(Self, Handle), BeginError> {
+        let directory = Directory::of(&paths.federations(), name);
+        directory.prepare(&request)?;
+        let view = FederationView {
+            name: name.to_owned(),
+            state: State::Starting,
+            id: random_id().map_err(BeginError::Random)?,
+            since_ns: stamp::now_ns(),
+            manifest: request.manifest.clone(),
+            directory: directory.path().to_path_buf(),
+            rti_port: None,
+            start_ns: None,
+            rti: MemberView::default(),
+            federates: Vec::new(),
+            outcome: None,
+        };
+        let record = Record {
+            protocol: PROTOCOL,
+            members: BTreeMap::new(),
+            view,
+        };
+        let origin = Instant::now();
+        let agent = Agent::start(now(origin), &request);
+        Ok(Self::new(
+            paths.clone(),
+            directory,
+            request,
+            (agent, record, origin),
+            told,
+        ))
+    }
+
+    /// Takes over a run that another daemon began.
+    pub(crate) fn adopt(
+        paths: &Paths,
+        directory: Directory,
+        record: Record,
+        told: broadcast::Sender<Happening>,
+    ) -> Result<(Self, Handle), StoreError> {
+        let request = directory.read_request()?;
+        let origin = Instant::now();
+        let launched = |id| record.members.contains_key(member_name(&request, id));
+        let agent = Agent::adopt(now(origin), &request, record.view.state, launched);
+        let state = (agent, record, origin);
+        let (mut federation, handle) = Self::new(paths.clone(), directory, request, state, told);
+        let kept = federation.directory.events_kept();
+        federation.told_until_ns = kept
+            .iter()
+            .map(|happening| happening.at_ns)
+            .max()
+            .unwrap_or(0);
+        for id in federation.ids() {
+            let name = member_name(&federation.request, id).to_owned();
+            if let Some(supervised) = federation.record.members.get(&name).cloned() {
+                federation.link(
+                    id,
+                    &name,
+                    supervised.instance.clone(),
+                    Origin::Adopt(supervised),
+                );
+            }
+        }
+        Ok((federation, handle))
+    }
+
+    fn new(
+        paths: Paths,
+        directory: Directory,
+        request: StartRequest,
+        (agent, record, origin): (Agent, Record, Instant),
+        told: broadcast::Sender<Happening>,
+    ) -> (Self, Handle) {
+        let (hear, heard) = mpsc::channel(QUEUE_MAX);
+        let (command, commands) = mpsc::channel(QUEUE_MAX);
+        let (view, seen) = watch::channel(record.view.clone());
+        let handle = Handle {
+            request: request.clone(),
+            commands: command,
+            view: seen,
+        };
+        let federation = Self {
+            paths,
+            directory,
+            request,
+            agent,
+            record,
+            links: BTreeMap::new(),
+            heard,
+            hear,
+            commands,
+            view,
+            told,
+            told_until_ns: 0,
+            at_ns: stamp::now_ns(),
+            origin,
+        };
+        (federation, handle)
+    }
+
+    /// Drives the federation to its end.
+    pub(crate) async fn run(mut self) {
+        loop {
+            self.drain();
+            if self.agent.outcome().is_some() {
+                return;
+            }
+            let timeout = self.agent.poll_timeout().map(|until| self.origin + until);
+            tokio::select! {
+                Some(heard) = self.heard.recv() => self.handle(heard),
+                Some(command) = self.commands.recv() => self.obey(command),
+                () = sleep_until(timeout.unwrap_or(self.origin)), if timeout.is_some() => {
+                    self.at_ns = stamp::now_ns();
+                    self.agent.handle_timeout(now(self.origin));
+                }
+            }
+        }
+    }
+
+    fn handle(&mut self, heard: Heard) {
+        match heard {
+            Heard::Identified { member, supervisor } => {
+                let name = member_name(&self.request, member);
+                if let Some(supervised) = self.record.members.get_mut(name) {
+                    supervised.supervisor = Some(supervisor);
+                    self.save();
+                }
+            }
+            Heard::Event {
+                member,
+                at_ns,
+                event,
+            } => {
+                self.at_ns = at_ns;
+                self.agent.handle_member(now(self.origin), member, event);
+            }
+        }
+    }
+
+    fn obey(&mut self, command: Command) {
+        self.at_ns = stamp::now_ns();
+        let now = now(self.origin);
+        match command {
+            Command::Stop => self.agent.handle_stop(now),
+            Command::Kill => self.agent.handle_kill(now),
+            Command::StarterGone => self.agent.handle_starter_gone(now),
+        }
+    }
+
+    /// Carries out every action; launches last, because their records must be on disk before.
+    fn drain(&mut self) {
+        let mut launches = Vec::new();
+        while let Some(action) = self.agent.poll_action() {
+            match action {
+                Action::Launch { member, rti_port } => launches.push((member, rti_port)),
+                Action::Signal { member, signal } => self.signal(member, signal),
+                Action::Tell(event) => self.tell(event),
+            }
+        }
+        let mut ready = Vec::new();
+        for (member, rti_port) in launches {
+            let name = member_name(&self.request, member).to_owned();
+            match random_id() {
+                Ok(instance) => ready.push((member, name, instance, rti_port)),
+                Err(error) => tracing::error!(%error, "no random id"),
+            }
+        }
+        for (_, name, instance, _) in &ready {
+            let supervised = Supervised {
+                instance: instance.clone(),
+                supervisor: None,
+            };
+            self.record.members.insert(name.clone(), supervised);
+        }
+        self.update(!ready.is_empty());
+        for (member, name, instance, rti_port) in ready {
+            let spec = launch::spec(
+                &launch::Place {
+                    paths: &self.paths,
+                    directory: &self.directory,
+                },
+                &self.request,
+                &self.record.view.id,
+                (member, rti_port),
+                instance.clone(),
+            );
+            self.link(member, &name, instance, Origin::Launch(Box::new(spec)));
+        }
+    }
+
+    fn link(&mut self, member: MemberId, name: &str, instance: String, origin: Origin) {
+        let (signal, signals) = mpsc::channel(SIGNALS_MAX);
+        self.links.insert(member, signal);
+        let link = Link {
+            member,
+            socket: self.paths.supervisor_socket(&instance),
+            spec: self.directory.spec(name),
+            exit_record: self.directory.exit_record(name),
+            instance,
+            hear: self.hear.clone(),
+            signals,
+        };
+        tokio::spawn(link.run(origin));
+    }
+
+    fn signal(&self, member: MemberId, signal: StopSignal) {
+        if let Some(link) = self.links.get(&member)
+            && let Err(error) = link.try_send(signal)
+        {
+            tracing::warn!(?member, ?signal, %error, "a signal was not passed on");
+        }
+    }
+
+    fn tell(&mut self, event: Event) {
+        let event = if let Event::Ended { outcome } = event {
+            Event::Ended {
+                outcome: outcome_with_log(outcome, &self.directory),
+            }
+        } else {
+            event
+        };
+        let (federation, at_ns) = (self.record.view.name.clone(), self.at_ns);
+        let happening = Happening {
+            at_ns,
+            federation,
+            event,
+        };
+        if at_ns <= self.told_until_ns && !matches!(happening.event, Event::Ended { .. }) {
+            return;
+        }
+        if let Err(error) = self.directory.append_event(&happening) {
+            tracing::warn!(%error, "an event was not kept");
+        }
+        // Nobody may be listening.
+        self.told.send(happening).ok();
+    }
+
+    /// Publishes the view, and writes the record when something other than progress changed.
+    fn update(&mut self, launching: bool) {
+        let view = FederationView {
+            state: self.agent.state(),
+            rti_port: self.agent.rti_port(),
+            start_ns: self.agent.start_ns(),
+            rti: self.agent.rti_view(),
+            federates: self.agent.federate_views(),
+            outcome: self
+                .agent
+                .outcome()
+                .cloned()
+                .map(|it| outcome_with_log(it, &self.directory)),
+            ..self.record.view.clone()
+        };
+        let coarse = |view: &FederationView| {
+            let states = view.federates.iter().chain([&view.rti]);
+            let states: Vec<_> = states.map(|it| (it.state.clone(), it.pid)).collect();
+            (view.state, view.outcome.clone(), states)
+        };
+        let changed = launching || coarse(&view) != coarse(&self.record.view);
+        self.record.view = view.clone();
+        if changed {
+            self.save();
+        }
+        self.view.send_replace(view);
+    }
+
+    fn save(&self) {
+        if let Err(error) = self.directory.write_record(&self.record) {
+            tracing::error!(%error, "the record was not written");
+        }
+    }
+
+    fn ids(&self) -> Vec<MemberId> {
+        let federates = self
+            .request
+            .federates
+            .iter()
+            .map(|run| MemberId::Federate(run.id));
+        std::iter::once(MemberId::Rti).chain(federates).collect()
+    }
+}
+
+fn now(origin: Instant) -> Now {
+    Now {
+        since: origin.elapsed(),
+        wall_ns: stamp::now_ns(),
+    }
+}
+
+fn member_name(request: &StartRequest, id: MemberId) -> &str {
+    match id {
+        MemberId::Rti => RTI,
+        MemberId::Federate(index) => &request.federates[usize::from(index)].name,
+    }
+}
+
+fn outcome_with_log(mut outcome: Outcome, directory: &Directory) -> Outcome {
+    if let Outcome::Failed { failure, .. } = &mut outcome {
+        let member = failure.member.as_deref();
+        failure.log = member.map(|member| log_path(&directory.logs(), member));
+    }
+    outcome
+}

@@ -1,0 +1,139 @@
+//! The command lines of the RTI, of our federates and of foreign ones.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use ictus_coord::plan::ClockSync;
+use ictus_deploy::{FederateKind, FederateRun};
+
+use crate::agent::{MemberId, RTI};
+use crate::api::StartRequest;
+use crate::paths::Paths;
+use crate::store::Directory;
+use crate::supervisor::log_path;
+use crate::supervisor::process::own_executable;
+use crate::supervisor::spec::{PROTOCOL, Spec};
+
+/// How long a supervisor keeps an unread exit record in memory; it stays on disk.
+const LINGER_MS: u32 = 5_000;
+/// Variables of the daemon that federates see, too.
+const PASSED_ON: [&str; 4] = ["HOME", "LANG", "PATH", "TZ"];
+
+/// Where a federation's files are.
+pub(crate) struct Place<'a> {
+    pub(crate) paths: &'a Paths,
+    pub(crate) directory: &'a Directory,
+}
+
+/// What a member's supervisor is to run.
+pub(crate) fn spec(
+    place: &Place<'_>,
+    request: &StartRequest,
+    federation_id: &str,
+    (member, rti_port): (MemberId, Option<u16>),
+    instance: String,
+) -> Spec {
+    let directory = place.directory;
+    let run = match member {
+        MemberId::Rti => None,
+        MemberId::Federate(index) => Some(&request.federates[usize::from(index)]),
+    };
+    let name = run.map_or(RTI, |run| &run.name).to_owned();
+    let mut env = passed_on();
+    let (program, args) = if let Some(run) = run {
+        env.extend(run.env.clone());
+        let rti = format!("127.0.0.1:{}", rti_port.unwrap_or(0));
+        (
+            run.executable.clone(),
+            federate_args(run, request, directory, federation_id, &rti),
+        )
+    } else {
+        (executable().to_path_buf(), rti_args(request, federation_id))
+    };
+    Spec {
+        protocol: PROTOCOL,
+        program,
+        args,
+        env,
+        cwd: request.cwd.clone(),
+        status: run.is_none_or(|run| run.kind == FederateKind::Ours),
+        log: log_path(&directory.logs(), &name),
+        log_size_max: request.settings.log_max_size,
+        log_files_max: request.settings.log_max_files.max(1),
+        socket: place.paths.supervisor_socket(&instance),
+        exit_record: directory.exit_record(&name),
+        linger_ms: LINGER_MS,
+        instance,
+        name,
+    }
+}
+
+/// This executable: the multi-call binary, which has the RTI and the supervisor.
+pub(crate) fn executable() -> &'static Path {
+    own_executable()
+}
+
+fn passed_on() -> BTreeMap<String, String> {
+    let variable = |name: &str| Some((name.to_owned(), std::env::var(name).ok()?));
+    PASSED_ON.into_iter().filter_map(variable).collect()
+}
+
+fn rti_args(request: &StartRequest, federation_id: &str) -> Vec<String> {
+    let clock = match request.settings.clock {
+        ClockSync::Off => "off",
+        ClockSync::Init => "init",
+    };
+    let federates = request.federates.len().to_string();
+    let port = request.settings.rti_port.unwrap_or(0).to_string();
+    [
+        "rti",
+        "-i",
+        federation_id,
+        "-n",
+        &federates,
+        "-p",
+        &port,
+        "-c",
+        clock,
+    ]
+    .map(str::to_owned)
+    .to_vec()
+}
+
+fn federate_args(
+    run: &FederateRun,
+    request: &StartRequest,
+    directory: &Directory,
+    federation_id: &str,
+    rti: &str,
+) -> Vec<String> {
+    let path = |path: &Path| path.to_string_lossy().into_owned();
+    match &run.kind {
+        FederateKind::Foreign { args } => {
+            let ours = ["-i", federation_id, "--rti", rti].map(str::to_owned);
+            ours.into_iter().chain(args.iter().cloned()).collect()
+        }
+        FederateKind::Ours => {
+            let plan = path(&directory.plan());
+            let timing = path(&directory.timing());
+            let mut args = [
+                "--plan",
+                &plan,
+                "--federate",
+                &run.name,
+                "--rti",
+                rti,
+                "-i",
+                federation_id,
+                "--timing",
+                &timing,
+            ]
+            .map(str::to_owned)
+            .to_vec();
+            if request.trace {
+                args.extend(["--trace".to_owned(), path(&directory.trace())]);
+            }
+            args
+        }
+    }
+}

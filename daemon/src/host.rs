@@ -1,0 +1,265 @@
+//! All federations of this host: which live, which are only on disk.
+
+use std::collections::BTreeMap;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+
+use tokio::sync::{broadcast, watch};
+use tokio::time::Instant;
+
+use crate::agent::RTI;
+use crate::api::{ApiError, ErrorCode, FederationView, Happening, Removed, StartRequest};
+use crate::federation::{BeginError, Command, Federation, Handle};
+use crate::paths::Paths;
+use crate::store::{self, Directory, StoreError};
+
+/// Events that a slow follower may miss before it is disconnected.
+const EVENTS_MAX: usize = 4096;
+
+/// The registry of federations; clones share it.
+#[derive(Clone, Debug)]
+pub(crate) struct Host(Arc<Inner>);
+
+#[derive(Debug)]
+struct Inner {
+    paths: Paths,
+    living: Mutex<BTreeMap<String, Handle>>,
+    told: broadcast::Sender<Happening>,
+    /// When something was last asked or owned.
+    active: watch::Sender<Instant>,
+    end: watch::Sender<bool>,
+}
+
+impl Host {
+    pub(crate) fn new(paths: Paths) -> Self {
+        Self(Arc::new(Inner {
+            paths,
+            living: Mutex::default(),
+            told: broadcast::channel(EVENTS_MAX).0,
+            active: watch::channel(Instant::now()).0,
+            end: watch::channel(false).0,
+        }))
+    }
+
+    pub(crate) fn paths(&self) -> &Paths {
+        &self.0.paths
+    }
+
+    /// Takes over every run that an earlier daemon left.
+    pub(crate) fn adopt_all(&self) {
+        for name in store::names(&self.0.paths.federations()) {
+            let directory = self.directory(&name);
+            match directory.read_record() {
+                Ok(Some(record)) if record.view.outcome.is_none() => {
+                    let told = self.0.told.clone();
+                    match Federation::adopt(&self.0.paths, directory, record, told) {
+                        Ok((federation, handle)) => self.spawn(name, federation, handle),
+                        Err(error) => tracing::error!(%name, %error, "not adopted"),
+                    }
+                }
+                Ok(_) => {}
+                Err(error) => tracing::error!(%name, %error, "not adopted"),
+            }
+        }
+    }
+
+    /// Begins a federation; every later event of it reaches `subscribe`d receivers.
+    pub(crate) fn start(&self, name: &str, request: StartRequest) -> Result<Handle, ApiError> {
+        validate(name, &request)?;
+        if let Some(living) = self.living().get(name) {
+            let same = living.request == request;
+            let code = if same {
+                ErrorCode::AlreadyRunning
+            } else {
+                ErrorCode::Conflict
+            };
+            return Err(ApiError {
+                code,
+                message: format!("federation `{name}` is already running"),
+                known: Vec::new(),
+            });
+        }
+        let told = self.0.told.clone();
+        let (federation, handle) = Federation::start(&self.0.paths, name, request, told)
+            .map_err(|error| begin_error(&error))?;
+        self.spawn(name.to_owned(), federation, handle.clone());
+        Ok(handle)
+    }
+
+    /// The federation of this name, if it lives.
+    pub(crate) fn handle(&self, name: &str) -> Option<Handle> {
+        self.living().get(name).cloned()
+    }
+
+    /// Every event from now on.
+    pub(crate) fn subscribe(&self) -> broadcast::Receiver<Happening> {
+        self.0.told.subscribe()
+    }
+
+    /// A federation as it is, or as it ended.
+    pub(crate) fn view(&self, name: &str) -> Result<FederationView, ApiError> {
+        if let Some(handle) = self.handle(name) {
+            return Ok(handle.view.borrow().clone());
+        }
+        self.check_known(name)?;
+        let record = self
+            .directory(name)
+            .read_record()
+            .map_err(|error| store_error(&error))?;
+        record
+            .map(|record| record.view)
+            .ok_or_else(|| self.unknown(name))
+    }
+
+    /// Every federation that lives or has ended and was not taken down.
+    pub(crate) fn views(&self) -> Vec<FederationView> {
+        let names = store::names(&self.0.paths.federations());
+        names
+            .iter()
+            .filter_map(|name| self.view(name).ok())
+            .collect()
+    }
+
+    /// The directory of a federation that lives, has ended, or was taken down with its logs kept.
+    pub(crate) fn known_directory(&self, name: &str) -> Result<Directory, ApiError> {
+        self.check_known(name)?;
+        Ok(self.directory(name))
+    }
+
+    /// Stops a federation if it lives, waits for its end, and removes what it left.
+    pub(crate) async fn remove(&self, name: &str, purge: bool) -> Result<Removed, ApiError> {
+        self.check_known(name)?;
+        let mut outcome = self.view(name).ok().and_then(|view| view.outcome);
+        if let Some(mut handle) = self.handle(name) {
+            handle.commands.send(Command::Stop).await.ok();
+            // Fails when the driver is gone, which is what is waited for.
+            while handle.view.changed().await.is_ok() {}
+            outcome = handle.view.borrow().outcome.clone();
+        }
+        let kept = self
+            .directory(name)
+            .remove(purge)
+            .map_err(|error| store_error(&error))?;
+        if purge {
+            // Only when it was the last one.
+            std::fs::remove_dir(self.0.paths.federations()).ok();
+        }
+        Ok(Removed { outcome, kept })
+    }
+
+    /// Notes that somebody asked for something.
+    pub(crate) fn touch(&self) {
+        self.0.active.send_replace(Instant::now());
+    }
+
+    /// When something was last asked for or owned.
+    pub(crate) fn last_active(&self) -> Instant {
+        if !self.living().is_empty() {
+            self.touch();
+        }
+        *self.0.active.borrow()
+    }
+
+    /// Ends the daemon if it owns nothing; tells whether it does.
+    pub(crate) fn end_if_idle(&self) -> bool {
+        let idle = self.living().is_empty();
+        if idle {
+            self.0.end.send_replace(true);
+        }
+        idle
+    }
+
+    /// Waits until [`Host::end_if_idle`] has succeeded.
+    pub(crate) async fn ended(&self) {
+        let mut end = self.0.end.subscribe();
+        end.wait_for(|end| *end).await.ok();
+    }
+
+    fn spawn(&self, name: String, federation: Federation, handle: Handle) {
+        self.living().insert(name.clone(), handle);
+        let host = self.clone();
+        tokio::spawn(async move {
+            federation.run().await;
+            // No await in between: who saw the end can start the same name again.
+            host.living().remove(&name);
+            host.touch();
+        });
+    }
+
+    fn directory(&self, name: &str) -> Directory {
+        Directory::of(&self.0.paths.federations(), name)
+    }
+
+    fn check_known(&self, name: &str) -> Result<(), ApiError> {
+        let known = store::is_name(name) && self.directory(name).path().is_dir();
+        if known {
+            Ok(())
+        } else {
+            Err(self.unknown(name))
+        }
+    }
+
+    fn unknown(&self, name: &str) -> ApiError {
+        ApiError {
+            code: ErrorCode::Unknown,
+            message: format!("there is no federation `{name}`"),
+            known: store::names(&self.0.paths.federations()),
+        }
+    }
+
+    fn living(&self) -> MutexGuard<'_, BTreeMap<String, Handle>> {
+        // The map is consistent after every operation on it.
+        self.0.living.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+fn validate(name: &str, request: &StartRequest) -> Result<(), ApiError> {
+    let bad = |message: String| ApiError {
+        code: ErrorCode::BadRequest,
+        message,
+        known: Vec::new(),
+    };
+    if !store::is_name(name) {
+        return Err(bad(format!("`{name}` cannot be a federation's name")));
+    }
+    let names = request
+        .plan
+        .federates
+        .iter()
+        .map(|federate| federate.name.as_str());
+    if !names.eq(request.federates.iter().map(|run| run.name.as_str())) {
+        return Err(bad("plan and federates do not match".to_owned()));
+    }
+    for (run, id) in request.federates.iter().zip(0_u16..) {
+        if run.id != id || !store::is_name(&run.name) || run.name == RTI {
+            return Err(bad(format!("`{}` cannot be a federate's name", run.name)));
+        }
+    }
+    Ok(())
+}
+
+fn begin_error(error: &BeginError) -> ApiError {
+    ApiError {
+        code: ErrorCode::Failed,
+        message: with_sources(error),
+        known: Vec::new(),
+    }
+}
+
+fn store_error(error: &StoreError) -> ApiError {
+    ApiError {
+        code: ErrorCode::Failed,
+        message: with_sources(error),
+        known: Vec::new(),
+    }
+}
+
+/// An error and its sources on one line.
+pub(crate) fn with_sources(error: &dyn std::error::Error) -> String {
+    let mut text = error.to_string();
+    let mut source = error.source();
+    while let Some(error) = source {
+        text.push_str(&format!(": {error}"));
+        source = error.source();
+    }
+    text
+}

@@ -1,0 +1,437 @@
+//! The API's routes; see [`crate::api`].
+
+use std::convert::Infallible;
+use std::io;
+use std::pin::Pin;
+use std::task::{Context, Poll};
+use std::time::Duration;
+
+use axum::Router;
+use axum::body::{Body, Bytes};
+use axum::extract::{Path, Query, Request, State};
+use axum::http::StatusCode;
+use axum::http::header::CONTENT_TYPE;
+use axum::middleware::{Next, from_fn_with_state};
+use axum::response::{IntoResponse, Json, Response};
+use axum::routing::{get, post};
+use hyper::body::Frame;
+use serde::{Deserialize, Serialize};
+use tokio::net::{UnixListener, UnixStream};
+use tokio::sync::{broadcast, mpsc};
+
+use crate::api::{
+    ApiError, ErrorCode, Event, FederationView, Happening, Info, LogLine, Removed, StartRequest,
+    VERSION,
+};
+use crate::federation::Command;
+use crate::host::Host;
+use crate::logs::Follower;
+
+/// Lines of a stream that wait for a slow client.
+const LINES_MAX: usize = 1024;
+/// How often growing log files are looked at.
+const FOLLOW_PERIOD: Duration = Duration::from_millis(100);
+/// How long to wait before another connection is tried when the system is out of descriptors.
+const ACCEPT_PAUSE: Duration = Duration::from_millis(100);
+
+/// The host's events.
+type Told = broadcast::Receiver<Happening>;
+
+/// The routes over a host.
+pub(crate) fn router(host: Host) -> Router {
+    let federation = get(federation).post(start).delete(remove);
+    Router::new()
+        .route("/v1/info", get(info))
+        .route("/v1/federations", get(federations))
+        .route("/v1/federations/{name}", federation)
+        .route("/v1/federations/{name}/stop", post(stop))
+        .route("/v1/federations/{name}/logs", get(logs))
+        .route("/v1/events", get(events))
+        .route("/v1/end", post(end))
+        .fallback(async || bad_request("no such call; is the daemon of another version?"))
+        .layer(from_fn_with_state(host.clone(), touch))
+        .with_state(host)
+}
+
+/// Accepts connections of this user only.
+#[derive(Debug)]
+pub(crate) struct OwnListener(pub(crate) UnixListener);
+
+impl axum::serve::Listener for OwnListener {
+    type Io = UnixStream;
+    type Addr = tokio::net::unix::SocketAddr;
+
+    async fn accept(&mut self) -> (Self::Io, Self::Addr) {
+        let own = rustix::process::geteuid().as_raw();
+        loop {
+            match self.0.accept().await {
+                Ok((stream, address)) => match stream.peer_cred() {
+                    Ok(peer) if peer.uid() == own => return (stream, address),
+                    Ok(peer) => tracing::warn!(uid = peer.uid(), "another user was refused"),
+                    Err(error) => tracing::warn!(%error, "a nameless peer was refused"),
+                },
+                Err(error) => {
+                    tracing::warn!(%error, "cannot accept");
+                    tokio::time::sleep(ACCEPT_PAUSE).await;
+                }
+            }
+        }
+    }
+
+    fn local_addr(&self) -> io::Result<Self::Addr> {
+        self.0.local_addr()
+    }
+}
+
+async fn touch(State(host): State<Host>, request: Request, next: Next) -> Response {
+    host.touch();
+    next.run(request).await
+}
+
+async fn info(State(host): State<Host>) -> Json<Info> {
+    Json(Info {
+        api: VERSION.to_owned(),
+        version: env!("CARGO_PKG_VERSION").to_owned(),
+        pid: std::process::id(),
+        state_dir: host.paths().state.clone(),
+    })
+}
+
+async fn federations(State(host): State<Host>) -> Json<Vec<FederationView>> {
+    Json(host.views())
+}
+
+async fn federation(
+    State(host): State<Host>,
+    Path(name): Path<String>,
+) -> Result<Json<FederationView>, ApiError> {
+    host.view(&name).map(Json)
+}
+
+async fn start(
+    State(host): State<Host>,
+    Path(name): Path<String>,
+    body: Bytes,
+) -> Result<Response, ApiError> {
+    let request: StartRequest =
+        serde_json::from_slice(&body).map_err(|error| bad_request(&error.to_string()))?;
+    let told = host.subscribe();
+    let handle = host.start(&name, request)?;
+    let (lines, body) = JsonLines::new(Some(StarterGuard(handle.commands)));
+    tokio::spawn(pass_until_end(told, name, lines));
+    Ok(stream(body))
+}
+
+#[derive(Deserialize)]
+struct StopQuery {
+    #[serde(default)]
+    kill: bool,
+}
+
+async fn stop(
+    State(host): State<Host>,
+    Path(name): Path<String>,
+    Query(query): Query<StopQuery>,
+) -> Result<Response, ApiError> {
+    let told = host.subscribe();
+    let (lines, body) = JsonLines::new(None);
+    let Some(handle) = host.handle(&name) else {
+        // It has ended already: its end is all there is to tell.
+        let view = host.view(&name)?;
+        if let Some(outcome) = view.outcome {
+            let event = Event::Ended { outcome };
+            lines
+                .send(&Happening {
+                    at_ns: view.since_ns,
+                    federation: name,
+                    event,
+                })
+                .await;
+        }
+        return Ok(stream(body));
+    };
+    let command = if query.kill {
+        Command::Kill
+    } else {
+        Command::Stop
+    };
+    handle.commands.send(command).await.ok();
+    tokio::spawn(pass_until_end(told, name, lines));
+    Ok(stream(body))
+}
+
+#[derive(Deserialize)]
+struct RemoveQuery {
+    #[serde(default)]
+    purge: bool,
+}
+
+async fn remove(
+    State(host): State<Host>,
+    Path(name): Path<String>,
+    Query(query): Query<RemoveQuery>,
+) -> Result<Json<Removed>, ApiError> {
+    // In a task: a client that goes away does not leave half a removal.
+    let removal = tokio::spawn(async move { host.remove(&name, query.purge).await });
+    removal
+        .await
+        .unwrap_or_else(|error| {
+            let (code, message) = (ErrorCode::Failed, error.to_string());
+            Err(ApiError {
+                code,
+                message,
+                known: Vec::new(),
+            })
+        })
+        .map(Json)
+}
+
+#[derive(Deserialize)]
+struct LogsQuery {
+    #[serde(default)]
+    follow: bool,
+    /// Names joined by commas; empty: everybody.
+    #[serde(default)]
+    federate: String,
+    /// Only the last so many lines of what is there.
+    tail: Option<usize>,
+}
+
+async fn logs(
+    State(host): State<Host>,
+    Path(name): Path<String>,
+    Query(query): Query<LogsQuery>,
+) -> Result<Response, ApiError> {
+    let logs = host.known_directory(&name)?.logs();
+    let members: Vec<_> = query
+        .federate
+        .split(',')
+        .filter(|it| !it.is_empty())
+        .map(str::to_owned)
+        .collect();
+    let known = crate::logs::members(&logs);
+    if let Some(unknown) = members.iter().find(|member| !known.contains(member)) {
+        let message = format!("federation `{name}` has no log of `{unknown}`");
+        return Err(ApiError {
+            code: ErrorCode::Unknown,
+            message,
+            known,
+        });
+    }
+    let (lines, body) = JsonLines::new(None);
+    tokio::spawn(follow_logs(
+        host,
+        name,
+        Follower::new(&logs, members),
+        query,
+        lines,
+    ));
+    Ok(stream(body))
+}
+
+async fn follow_logs(
+    host: Host,
+    name: String,
+    mut follower: Follower,
+    query: LogsQuery,
+    lines: Sender,
+) {
+    let mut tail = query.tail;
+    loop {
+        // Asked before reading, so that what is written until the end is read.
+        let living = host.handle(&name).is_some();
+        let sender = lines.clone();
+        let keep = tail.take();
+        let read = tokio::task::spawn_blocking(move || {
+            read_logs(&mut follower, keep, &sender);
+            follower
+        });
+        let Ok(back) = read.await else { return };
+        follower = back;
+        if !query.follow || !living {
+            return;
+        }
+        tokio::select! {
+            () = lines.0.closed() => return,
+            () = tokio::time::sleep(FOLLOW_PERIOD) => {}
+        }
+    }
+}
+
+fn read_logs(follower: &mut Follower, tail: Option<usize>, lines: &Sender) {
+    let Some(tail) = tail else {
+        follower.read(|line| lines.blocking_send(&line));
+        return;
+    };
+    let mut last: std::collections::VecDeque<LogLine> = std::collections::VecDeque::new();
+    follower.read(|line| {
+        last.push_back(line);
+        if last.len() > tail {
+            last.pop_front();
+        }
+    });
+    for line in last {
+        lines.blocking_send(&line);
+    }
+}
+
+#[derive(Deserialize)]
+struct EventsQuery {
+    #[serde(default)]
+    follow: bool,
+    federation: Option<String>,
+}
+
+async fn events(
+    State(host): State<Host>,
+    Query(query): Query<EventsQuery>,
+) -> Result<Response, ApiError> {
+    let told = host.subscribe();
+    let mut kept = Vec::new();
+    let names = match &query.federation {
+        Some(name) => vec![name.clone()],
+        None => crate::store::names(&host.paths().federations()),
+    };
+    for name in names {
+        kept.extend(host.known_directory(&name)?.events_kept());
+    }
+    kept.sort_by_key(|happening| happening.at_ns);
+    let (lines, body) = JsonLines::new(None);
+    tokio::spawn(async move {
+        for happening in kept {
+            lines.send(&happening).await;
+        }
+        if query.follow {
+            pass(told, query.federation, lines).await;
+        }
+    });
+    Ok(stream(body))
+}
+
+async fn end(State(host): State<Host>) -> Json<bool> {
+    Json(host.end_if_idle())
+}
+
+/// Passes a federation's events on until its end, or until nobody listens.
+async fn pass_until_end(mut told: Told, name: String, lines: Sender) {
+    while let Some(happening) = next(&mut told, &lines).await {
+        if happening.federation == name {
+            lines.send(&happening).await;
+            if matches!(happening.event, Event::Ended { .. }) {
+                return;
+            }
+        }
+    }
+}
+
+/// Passes events on, of one federation or of all, until nobody listens.
+async fn pass(mut told: Told, federation: Option<String>, lines: Sender) {
+    while let Some(happening) = next(&mut told, &lines).await {
+        if federation
+            .as_ref()
+            .is_none_or(|name| *name == happening.federation)
+        {
+            lines.send(&happening).await;
+        }
+    }
+}
+
+/// The next event; absent when nobody listens any more, or the listener was so slow that events were lost.
+async fn next(told: &mut Told, lines: &Sender) -> Option<Happening> {
+    tokio::select! {
+        () = lines.0.closed() => None,
+        happening = told.recv() => happening.ok(),
+    }
+}
+
+fn stream(body: JsonLines) -> Response {
+    ([(CONTENT_TYPE, "application/x-ndjson")], Body::new(body)).into_response()
+}
+
+/// A response body that grows a line at a time.
+struct JsonLines {
+    lines: mpsc::Receiver<Bytes>,
+    /// Dropped with the body, that is when the client goes away.
+    _guard: Option<StarterGuard>,
+}
+
+/// The writing end of [`JsonLines`].
+#[derive(Clone)]
+struct Sender(mpsc::Sender<Bytes>);
+
+/// Tells the federation that who started it is gone.
+struct StarterGuard(mpsc::Sender<Command>);
+
+impl Drop for StarterGuard {
+    fn drop(&mut self) {
+        self.0.try_send(Command::StarterGone).ok();
+    }
+}
+
+impl JsonLines {
+    fn new(guard: Option<StarterGuard>) -> (Sender, Self) {
+        let (sender, lines) = mpsc::channel(LINES_MAX);
+        (
+            Sender(sender),
+            Self {
+                lines,
+                _guard: guard,
+            },
+        )
+    }
+}
+
+impl Sender {
+    /// Waits for room; a client that is gone takes everything.
+    async fn send(&self, value: &impl Serialize) {
+        if let Some(line) = line(value) {
+            self.0.send(line).await.ok();
+        }
+    }
+
+    fn blocking_send(&self, value: &impl Serialize) {
+        if let Some(line) = line(value) {
+            self.0.blocking_send(line).ok();
+        }
+    }
+}
+
+fn line(value: &impl Serialize) -> Option<Bytes> {
+    let mut line = serde_json::to_vec(value).ok()?;
+    line.push(b'\n');
+    Some(Bytes::from(line))
+}
+
+impl hyper::body::Body for JsonLines {
+    type Data = Bytes;
+    type Error = Infallible;
+
+    fn poll_frame(
+        mut self: Pin<&mut Self>,
+        context: &mut Context<'_>,
+    ) -> Poll<Option<Result<Frame<Bytes>, Infallible>>> {
+        self.lines
+            .poll_recv(context)
+            .map(|line| line.map(|line| Ok(Frame::data(line))))
+    }
+}
+
+fn bad_request(message: &str) -> ApiError {
+    ApiError {
+        code: ErrorCode::BadRequest,
+        message: message.to_owned(),
+        known: Vec::new(),
+    }
+}
+
+impl IntoResponse for ApiError {
+    fn into_response(self) -> Response {
+        let status = match self.code {
+            ErrorCode::BadRequest => StatusCode::BAD_REQUEST,
+            ErrorCode::Unknown => StatusCode::NOT_FOUND,
+            ErrorCode::AlreadyRunning | ErrorCode::Conflict => StatusCode::CONFLICT,
+            ErrorCode::Failed => StatusCode::INTERNAL_SERVER_ERROR,
+        };
+        (status, Json(self)).into_response()
+    }
+}
