@@ -233,19 +233,34 @@ fn check_text(
     } else {
         workshop.inspect(report);
     }
-    let wires = wiring::wire(&manifest, &members, report);
-    causality::check(&members, &wires, report);
-    check_fast(&manifest, &members, report);
-    let timing = reactions::resolve(&manifest, &members, &wires, report);
-    Some(Checked {
-        manifest: absolute.to_path_buf(),
-        plan: plan(&manifest, &members, wires),
-        federates: runs(&members, &executables),
-        settings: settings(&manifest),
+    Some(conclude(
+        (absolute, &manifest),
+        &members,
+        &executables,
+        report,
+    ))
+}
+
+/// Everything that follows once it is known what the federates look like.
+fn conclude(
+    (path, manifest): (&Path, &Manifest),
+    members: &[Member<'_>],
+    executables: &Executables,
+    report: &mut Report,
+) -> Checked {
+    let wires = wiring::wire(manifest, members, report);
+    causality::check(members, &wires, report);
+    check_fast(manifest, members, report);
+    let timing = reactions::resolve(manifest, members, &wires, report);
+    Checked {
+        manifest: path.to_path_buf(),
+        plan: plan(manifest, members, wires),
+        federates: runs(members, executables),
+        settings: settings(manifest),
         timing,
-        one_program: one_program(&members, &executables),
+        one_program: one_program(members, executables),
         warnings: Vec::new(),
-    })
+    }
 }
 
 /// The manifest's form: YAML, `let`, keys and kinds of values.
@@ -414,5 +429,194 @@ fn settings(manifest: &Manifest) -> Settings {
             .map_or(basic.log_max_size, |size| size.0),
         log_max_files: defaults.logs.max_files.unwrap_or(basic.log_max_files),
         clock: manifest.clock.sync,
+    }
+}
+
+#[cfg(test)]
+#[path = "../testdata/classes.rs"]
+mod classes;
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeSet;
+
+    use ictus_coord::describe::InstanceRequest;
+    use proptest::prelude::*;
+    use serde_json::Value as Json;
+
+    use super::*;
+
+    const EXAMPLE: &str = include_str!("../example.yaml");
+
+    /// A whole check in which nothing runs: classes come from the table of the tests.
+    fn check_described(text: &str) -> Problems {
+        let mut report = Report::new(Path::new("federation.yaml"), text);
+        let options = CheckOptions::default();
+        if let Some(manifest) = form(text, &options, &mut report) {
+            let mut members = federation::members(&manifest, &mut report);
+            for member in &mut members {
+                member.description = Some(match member.origin {
+                    Origin::Foreign { .. } => federation::foreign_description(member.federate),
+                    Origin::Ours { class, .. } => classes::instance(&InstanceRequest {
+                        name: member.name.to_owned(),
+                        class: class.unwrap_or_default().to_owned(),
+                        parameters: federation::parameters(member.federate),
+                    }),
+                });
+            }
+            let path = Path::new("/nowhere/federation.yaml");
+            let executables = Executables::default();
+            let checked = conclude((path, &manifest), &members, &executables, &mut report);
+            assert_eq!(checked.plan.federates.len(), members.len());
+        }
+        report.finish().0
+    }
+
+    /// The paths of all properties of a schema, with `*` for names and positions.
+    fn properties(root: &Json, schema: &Json, path: &str, found: &mut BTreeSet<String>) {
+        let pointer = schema.get("$ref").and_then(Json::as_str).unwrap_or("#");
+        let schema = if pointer == "#" {
+            schema
+        } else {
+            root.pointer(&pointer[1..]).unwrap()
+        };
+        for (name, below) in schema
+            .get("properties")
+            .and_then(Json::as_object)
+            .into_iter()
+            .flatten()
+        {
+            let path = format!("{path}.{name}");
+            properties(root, below, &path, found);
+            found.insert(path);
+        }
+        for key in ["additionalProperties", "items"] {
+            if let Some(below) = schema.get(key).filter(|below| below.is_object()) {
+                properties(root, below, &format!("{path}.*"), found);
+            }
+        }
+    }
+
+    /// The paths of all keys of a document that the schema's paths cover.
+    fn keys(node: &Node, path: &str, known: &BTreeSet<String>, found: &mut BTreeSet<String>) {
+        match &node.value {
+            Value::Map(entries) => {
+                for (key, below) in entries {
+                    let named = format!("{path}.{}", key.name);
+                    let path = if known.contains(&named) {
+                        named
+                    } else {
+                        format!("{path}.*")
+                    };
+                    keys(below, &path, known, found);
+                    found.insert(path);
+                }
+            }
+            Value::List(items) => {
+                for item in items {
+                    keys(item, &format!("{path}.*"), known, found);
+                }
+            }
+            Value::Null | Value::Bool(_) | Value::Integer(_) | Value::Float(_) | Value::Text(_) => {
+            }
+        }
+    }
+
+    #[test]
+    fn the_example_has_every_key() {
+        assert_eq!(check_described(EXAMPLE), Problems::default());
+        let schema = schema();
+        let mut known = BTreeSet::new();
+        properties(&schema, &schema, "", &mut known);
+        assert!(known.len() > 40, "{known:?}");
+        let mut used = BTreeSet::new();
+        keys(&Node::parse(EXAMPLE).unwrap(), "", &known, &mut used);
+        assert_eq!(
+            known.difference(&used).collect::<Vec<_>>(),
+            Vec::<&String>::new()
+        );
+    }
+
+    #[test]
+    fn the_schema_describes_every_key() {
+        fn undescribed(schema: &Json, path: &str, found: &mut Vec<String>) {
+            for (name, below) in schema
+                .get("properties")
+                .and_then(Json::as_object)
+                .into_iter()
+                .flatten()
+            {
+                if below.get("description").is_none() {
+                    found.push(format!("{path}.{name}"));
+                }
+            }
+            for (name, below) in schema
+                .get("$defs")
+                .and_then(Json::as_object)
+                .into_iter()
+                .flatten()
+            {
+                undescribed(below, name, found);
+            }
+        }
+        let mut found = Vec::new();
+        undescribed(&schema(), "", &mut found);
+        assert_eq!(found, Vec::<String>::new());
+    }
+
+    #[test]
+    fn a_flood_of_mistakes_has_an_end() {
+        let mut text = EXAMPLE.to_owned();
+        for index in 0..5_000 {
+            text.push_str(&format!("k{index}: 1\n"));
+        }
+        let problems = check_described(&text);
+        assert!(problems.0.len() < 300);
+        assert!(
+            problems.to_string().contains("4800 more"),
+            "{}",
+            problems.0.len()
+        );
+    }
+
+    proptest! {
+        #![proptest_config(ProptestConfig::with_cases(512))]
+
+        /// Whatever is cut out of a manifest, doubled or written into it: an answer, never a panic, and
+        /// every problem has a place in the text.
+        #[test]
+        fn mutations_never_panic(
+            edits in prop::collection::vec((any::<u16>(), 0_usize..24, "[ -~\n\t{}\\[\\]:.$\u{e9}]{0,12}"), 1..6),
+        ) {
+            let mut text: Vec<char> = EXAMPLE.chars().collect();
+            for (at, length, insert) in edits {
+                let at = usize::from(at) % text.len();
+                let end = (at + length).min(text.len());
+                text.splice(at..end, insert.chars());
+            }
+            let text: String = text.into_iter().collect();
+            let lines = text.lines().count() + 1;
+            for problem in check_described(&text).0 {
+                prop_assert!(usize::try_from(problem.line).unwrap() <= lines, "{problem}");
+                prop_assert!(problem.column >= 1);
+            }
+        }
+
+        /// Whole lines moved, dropped and doubled keep more of the form than single characters do.
+        #[test]
+        fn shuffled_lines_never_panic(
+            edits in prop::collection::vec((any::<u16>(), any::<u16>(), 0_u8..3), 1..8),
+        ) {
+            let mut lines: Vec<&str> = EXAMPLE.lines().collect();
+            for (from, to, kind) in edits {
+                let (from, to) = (usize::from(from) % lines.len(), usize::from(to) % lines.len());
+                match kind {
+                    0 => drop(lines.remove(from)),
+                    1 => lines.insert(to, lines[from]),
+                    _ => lines.swap(from, to),
+                }
+            }
+            check_described(&lines.join("\n"));
+        }
     }
 }

@@ -12,6 +12,10 @@ pub fn explain(code: &str) -> Option<&'static str> {
 /// Every code, in order.
 pub(crate) const CODES: &[(&str, &str)] = &[
     (
+        "F000",
+        "There are more mistakes than are worth showing. Mend those above and check again.",
+    ),
+    (
         "F001",
         "The file cannot be read, or is not YAML. The place is where the reader gave up; the \
          mistake often stands a line before it: a missing colon, a bracket or quote that is not \
@@ -159,5 +163,26 @@ mod tests {
         assert!(CODES.windows(2).all(|pair| pair[0].0 < pair[1].0));
         assert!(explain("f012").is_some_and(|text| text.contains("port")));
         assert_eq!(explain("F999"), None);
+    }
+
+    /// Every code that is reported is explained, and the reverse.
+    #[test]
+    fn every_code_is_used() {
+        let dir = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("src");
+        let mut used = std::collections::BTreeSet::new();
+        for entry in std::fs::read_dir(dir).unwrap() {
+            let path = entry.unwrap().path();
+            if path.extension().is_none() || path.ends_with("codes.rs") {
+                continue;
+            }
+            let text = std::fs::read_to_string(path).unwrap();
+            for piece in text.split('"').filter(|piece| piece.len() == 4) {
+                if piece.starts_with(['F', 'W']) && piece[1..].bytes().all(|b| b.is_ascii_digit()) {
+                    used.insert(piece.to_owned());
+                }
+            }
+        }
+        let known: Vec<&str> = CODES.iter().map(|(code, _)| *code).collect();
+        assert_eq!(used.iter().map(String::as_str).collect::<Vec<_>>(), known);
     }
 }

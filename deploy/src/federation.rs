@@ -515,7 +515,10 @@ fn request(
     let known = &description.parameters;
     for name in member.federate.parameters.names() {
         if !known.iter().any(|parameter| parameter.name == name) {
-            let fix = suggest::fix(name, known.iter().map(|parameter| parameter.name.as_str()));
+            let fix = match known.as_slice() {
+                [] => "it has no parameters: remove it".to_owned(),
+                some => suggest::fix(name, some.iter().map(|parameter| parameter.name.as_str())),
+            };
             let place = Place::key(&["federates", member.name, "parameters", name]);
             report.add(
                 "F024",

@@ -7,6 +7,8 @@ use serde::Serialize;
 
 use crate::document::{Node, Part, Site};
 
+/// Mistakes beyond this many are only counted.
+const MAX_PROBLEMS: usize = 200;
 /// The widest piece of a line that a snippet shows, in characters.
 const SNIPPET_WIDTH: usize = 96;
 
@@ -134,6 +136,8 @@ pub(crate) struct Report {
     root: Option<Node>,
     problems: Vec<Problem>,
     warnings: Vec<Problem>,
+    /// Mistakes beyond the limit.
+    dropped: usize,
 }
 
 impl Report {
@@ -147,6 +151,7 @@ impl Report {
             root: None,
             problems: Vec::new(),
             warnings: Vec::new(),
+            dropped: 0,
         }
     }
 
@@ -163,6 +168,10 @@ impl Report {
         message: impl Into<String>,
         fix: impl Into<String>,
     ) {
+        if self.problems.len() >= MAX_PROBLEMS {
+            self.dropped += 1;
+            return;
+        }
         let problem = self.problem(code, place, message.into(), fix.into());
         if !self.problems.contains(&problem) {
             self.problems.push(problem);
@@ -177,8 +186,10 @@ impl Report {
         message: impl Into<String>,
         fix: impl Into<String>,
     ) {
-        let problem = self.problem(code, place, message.into(), fix.into());
-        self.warnings.push(problem);
+        if self.warnings.len() < MAX_PROBLEMS {
+            let problem = self.problem(code, place, message.into(), fix.into());
+            self.warnings.push(problem);
+        }
     }
 
     /// The line of a place, for a message about another one.
@@ -205,6 +216,12 @@ impl Report {
             |a: &Problem, b: &Problem| (a.line, a.column, a.code).cmp(&(b.line, b.column, b.code));
         self.problems.sort_by(order);
         self.warnings.sort_by(order);
+        if self.dropped > 0 {
+            let message = format!("{} more mistakes are not shown", self.dropped);
+            let place = Place::exact::<&str>(&[], Site::default());
+            self.problems
+                .push(self.problem("F000", place, message, String::new()));
+        }
         (Problems(self.problems), self.warnings)
     }
 

@@ -172,8 +172,9 @@ impl Outcome {
         };
         let text = |pointer: &str| message.pointer(pointer).and_then(serde_json::Value::as_str);
         match text("/reason") {
-            Some("compiler-message") if self.error.is_none() => {
-                if text("/message/level").is_some_and(|level| level.starts_with("error")) {
+            Some("compiler-message") => {
+                let wrong = text("/message/level").is_some_and(|level| level.starts_with("error"));
+                if wrong && self.error.is_none() {
                     self.error = text("/message/rendered").map(str::to_owned);
                 }
             }

@@ -1,6 +1,8 @@
 //! The form of a manifest against its schema: every unknown key, missing key and wrong value at once. What
 //! is wrong is reported and cut out, so that the rest can be checked for meaning.
 
+use std::collections::BTreeMap;
+
 use serde_json::Value as Json;
 
 use crate::document::{Key, Node, Part, Value};
@@ -65,13 +67,11 @@ impl<'a> Walker<'a> {
 
     fn mapping(&mut self, schema: &'a Json, node: &Node, entries: &[(Key, Node)]) -> Node {
         let mut kept: Vec<(Key, Node)> = Vec::new();
-        for (position, (key, below)) in entries.iter().enumerate() {
+        let mut lines: BTreeMap<&str, u32> = BTreeMap::new();
+        for (key, below) in entries {
             self.path.push(key.name.clone());
-            let first = entries[..position]
-                .iter()
-                .find(|(have, _)| have.name == key.name);
-            if let Some((first, _)) = first {
-                let (name, line) = (&key.name, first.site.line);
+            if let Some(line) = lines.get(key.name.as_str()) {
+                let name = &key.name;
                 let message = format!("duplicate key `{name}`: it stands already in line {line}");
                 let place = Place::exact(&self.path, key.site);
                 self.report.add(
@@ -80,8 +80,11 @@ impl<'a> Walker<'a> {
                     message,
                     "give it another name, or remove one",
                 );
-            } else if let Some(left) = self.entry(schema, key, below) {
-                kept.push((key.clone(), left));
+            } else {
+                lines.insert(&key.name, key.site.line);
+                if let Some(left) = self.entry(schema, key, below) {
+                    kept.push((key.clone(), left));
+                }
             }
             self.path.pop();
         }

@@ -1,6 +1,7 @@
 //! Logical traces read back: sets of `FEDERATE.trace` files, compared and hashed.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
+use std::fmt;
 use std::path::{Path, PathBuf};
 
 use serde::Serialize;
@@ -107,23 +108,478 @@ impl TraceSet {
     /// Reads every `.trace` file of a directory.
     ///
     /// # Errors
-    /// When a file cannot be read or a line is no record.
+    /// When a file cannot be read or a line is no record, and when there is no file.
     pub fn read(dir: &Path) -> Result<Self, TraceError> {
-        Err(TraceError::Empty {
+        let mut set = Self::default();
+        let files = files(dir, "trace").map_err(|source| TraceError::Unreadable {
             path: dir.to_path_buf(),
-        })
+            source,
+        })?;
+        if files.is_empty() {
+            return Err(TraceError::Empty {
+                path: dir.to_path_buf(),
+            });
+        }
+        for path in files {
+            let text = std::fs::read_to_string(&path);
+            let text = text.map_err(|source| TraceError::Unreadable {
+                path: path.clone(),
+                source,
+            })?;
+            let stem = path
+                .file_stem()
+                .unwrap_or_default()
+                .to_string_lossy()
+                .into_owned();
+            set.add(&stem, &text)
+                .map_err(|(line, what)| TraceError::Malformed { path, line, what })?;
+        }
+        set.sort();
+        Ok(set)
     }
 
-    /// The hash of all records: equal sets have equal hashes. 16 hexadecimal digits.
+    /// The hash of all records: equal sets have equal hashes. 16 hexadecimal digits (FNV-1a).
     #[must_use]
     pub fn hash(&self) -> String {
-        String::new()
+        let mut hash = 0xcbf2_9ce4_8422_2325_u64;
+        for record in self.federates.values().flat_map(|trace| &trace.records) {
+            for byte in format!("{record}\n").bytes() {
+                hash = (hash ^ u64::from(byte)).wrapping_mul(0x100_0000_01b3);
+            }
+        }
+        format!("{hash:016x}")
+    }
+
+    /// How many records each federate has.
+    #[must_use]
+    pub fn records_per_federate(&self) -> BTreeMap<String, usize> {
+        let count = |(name, trace): (&String, &FederateTrace)| (name.clone(), trace.records.len());
+        self.federates.iter().map(count).collect()
+    }
+
+    /// Adds one file's lines; the error is the line, from 1, and what is wrong with it.
+    fn add(&mut self, stem: &str, text: &str) -> Result<(), (usize, &'static str)> {
+        let mut seen: BTreeSet<String> = BTreeSet::new();
+        let mut stop = None;
+        let mut end = None;
+        for (index, line) in text.lines().enumerate() {
+            let wrong = |what| (index + 1, what);
+            if let Some(comment) = line.strip_prefix('#') {
+                match Comment::parse(comment).map_err(wrong)? {
+                    Comment::Physical(tag, path) => {
+                        let federate = federate_of(&path).to_owned();
+                        let trace = self.federates.entry(federate.clone()).or_default();
+                        trace.physical.push((tag, path));
+                        seen.insert(federate);
+                    }
+                    Comment::Stop(tag) => stop = Some(tag),
+                    Comment::End(tag, reason) => end = Some((tag, reason)),
+                    Comment::Other => {}
+                }
+            } else if !line.is_empty() {
+                let record = Record::parse(line).map_err(wrong)?;
+                let federate = federate_of(&record.path).to_owned();
+                self.federates
+                    .entry(federate.clone())
+                    .or_default()
+                    .records
+                    .push(record);
+                seen.insert(federate);
+            }
+        }
+        if seen.is_empty() {
+            seen.insert(stem.to_owned());
+        }
+        for federate in seen {
+            let trace = self.federates.entry(federate).or_default();
+            trace.stop = trace.stop.or(stop);
+            trace.end = trace.end.take().or_else(|| end.clone());
+        }
+        Ok(())
+    }
+
+    fn sort(&mut self) {
+        for trace in self.federates.values_mut() {
+            trace.records.sort();
+            trace.physical.sort();
+        }
     }
 }
 
-/// Compares two runs; see [`Verdict`].
+/// Compares two runs.
+///
+/// Law: a set is equal to itself, when it is complete and every value has a digest; and swapping the sets swaps
+/// the sides of a difference.
 #[must_use]
 pub fn compare(a: &TraceSet, b: &TraceSet) -> Verdict {
-    let _ = (a, b);
-    Verdict::NotComparable { why: String::new() }
+    for (side, set) in [("first", a), ("second", b)] {
+        for (name, trace) in &set.federates {
+            if trace.end.is_none() {
+                let why = format!("the {side} run's trace of `{name}` has no end: it was cut off");
+                return Verdict::NotComparable { why };
+            }
+        }
+    }
+    let stops = (earliest_stop(a), earliest_stop(b));
+    let limit = match stops {
+        (left, right) if left == right => None,
+        (left, right) => left.into_iter().chain(right).min(),
+    };
+    if let Some(difference) = first_difference(a, b, limit) {
+        return excuse(a, b, &difference).unwrap_or_else(|| difference.into());
+    }
+    if let Some(limit) = limit {
+        let why = format!("a run was stopped by request at {limit}; up to there both are equal");
+        return Verdict::NotComparable { why };
+    }
+    let undigested = |record: &&Record| record.effects.split(',').any(|one| one.ends_with("=?"));
+    if let Some(record) = records(a).find(undigested) {
+        let why = format!("a value has no digest, so it cannot be compared: {record}");
+        return Verdict::NotComparable { why };
+    }
+    Verdict::Equal {
+        records_per_federate: a.records_per_federate(),
+    }
+}
+
+/// A place at which two sets differ.
+#[derive(Debug)]
+struct Difference<'a> {
+    federate: &'a str,
+    left: Option<&'a Record>,
+    right: Option<&'a Record>,
+}
+
+impl Difference<'_> {
+    fn tag(&self) -> TraceTag {
+        let tags = self
+            .left
+            .into_iter()
+            .chain(self.right)
+            .map(|record| record.tag);
+        tags.min().unwrap_or_default()
+    }
+}
+
+impl From<Difference<'_>> for Verdict {
+    fn from(difference: Difference<'_>) -> Self {
+        Self::Different {
+            federate: difference.federate.to_owned(),
+            left: difference.left.cloned(),
+            right: difference.right.cloned(),
+        }
+    }
+}
+
+/// The difference at the lowest tag, below a limit if there is one.
+fn first_difference<'a>(
+    a: &'a TraceSet,
+    b: &'a TraceSet,
+    limit: Option<TraceTag>,
+) -> Option<Difference<'a>> {
+    let empty: &'static [Record] = &[];
+    let names: BTreeSet<&str> = a
+        .federates
+        .keys()
+        .chain(b.federates.keys())
+        .map(String::as_str)
+        .collect();
+    let within = |record: &&Record| limit.is_none_or(|limit| record.tag < limit);
+    let differences = names.into_iter().filter_map(|federate| {
+        let side = |set: &'a TraceSet| set.federates.get(federate).map_or(empty, |t| &t.records);
+        let mut left = side(a).iter().filter(within);
+        let mut right = side(b).iter().filter(within);
+        loop {
+            match (left.next(), right.next()) {
+                (None, None) => return None,
+                (one, other) if one == other => {}
+                (left, right) => {
+                    return Some(Difference {
+                        federate,
+                        left,
+                        right,
+                    });
+                }
+            }
+        }
+    });
+    differences.min_by_key(|difference| (difference.tag(), difference.federate))
+}
+
+/// Why a difference proves nothing: something that no run repeats came before it.
+fn excuse(a: &TraceSet, b: &TraceSet, difference: &Difference<'_>) -> Option<Verdict> {
+    let tag = difference.tag();
+    let deadline = records(a)
+        .chain(records(b))
+        .find(|r| r.kind == "deadline" && r.tag <= tag);
+    if let Some(record) = deadline {
+        let why = format!("a deadline was missed before the runs differ: {record}");
+        return Some(Verdict::NotComparable { why });
+    }
+    let physical = a
+        .federates
+        .values()
+        .chain(b.federates.values())
+        .flat_map(|t| &t.physical);
+    let (at, path) = physical.filter(|(at, _)| *at <= tag).min()?;
+    let why = format!("a physical event came before the runs differ: {path} at {at}");
+    Some(Verdict::NotComparable { why })
+}
+
+fn records(set: &TraceSet) -> impl Iterator<Item = &Record> {
+    set.federates.values().flat_map(|trace| &trace.records)
+}
+
+fn earliest_stop(set: &TraceSet) -> Option<TraceTag> {
+    set.federates.values().filter_map(|trace| trace.stop).min()
+}
+
+/// The first element of a reactor's path.
+fn federate_of(path: &str) -> &str {
+    path.split(['.', '[']).next().unwrap_or(path)
+}
+
+/// A line that starts with `#`.
+enum Comment {
+    Physical(TraceTag, String),
+    Stop(TraceTag),
+    End(TraceTag, String),
+    Other,
+}
+
+impl Comment {
+    fn parse(text: &str) -> Result<Self, &'static str> {
+        let mut words = text.split_whitespace();
+        let kind = words.next();
+        if !matches!(kind, Some("physical" | "stop" | "end")) {
+            return Ok(Self::Other);
+        }
+        let tag = TraceTag::parse(words.next(), words.next())?;
+        let rest = words.collect::<Vec<_>>().join(" ");
+        Ok(match kind {
+            Some("physical") => Self::Physical(tag, rest),
+            Some("stop") => Self::Stop(tag),
+            _ => Self::End(tag, rest),
+        })
+    }
+}
+
+impl Record {
+    fn parse(line: &str) -> Result<Self, &'static str> {
+        let mut fields = line.split('\t');
+        let tag = TraceTag::parse(fields.next(), fields.next())?;
+        let path = fields
+            .next()
+            .filter(|path| !path.is_empty())
+            .ok_or("no path")?;
+        let index = fields
+            .next()
+            .and_then(|field| field.parse().ok())
+            .ok_or("no index")?;
+        let kind = fields.next().ok_or("no kind")?;
+        let effects = fields.next().ok_or("no effects")?;
+        if fields.next().is_some() {
+            return Err("more than six fields");
+        }
+        if !matches!(kind, "body" | "deadline") {
+            return Err("the kind is neither `body` nor `deadline`");
+        }
+        let (path, kind, effects) = (path.to_owned(), kind.to_owned(), effects.to_owned());
+        Ok(Self {
+            tag,
+            path,
+            index,
+            kind,
+            effects,
+        })
+    }
+}
+
+impl fmt::Display for Record {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self {
+            tag,
+            path,
+            index,
+            kind,
+            effects,
+        } = self;
+        write!(f, "{tag} {path} #{index} {kind} {effects}")
+    }
+}
+
+impl TraceTag {
+    /// From the first two fields of a trace or timing line.
+    pub(crate) fn parse(
+        time_ns: Option<&str>,
+        microstep: Option<&str>,
+    ) -> Result<Self, &'static str> {
+        let time_ns = time_ns
+            .and_then(|field| field.parse().ok())
+            .ok_or("no time")?;
+        let microstep = microstep
+            .and_then(|field| field.parse().ok())
+            .ok_or("no microstep")?;
+        Ok(Self { time_ns, microstep })
+    }
+}
+
+impl fmt::Display for TraceTag {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(
+            f,
+            "({}, {})",
+            ictus_core::Duration::from_nanos(self.time_ns),
+            self.microstep
+        )
+    }
+}
+
+impl fmt::Display for Verdict {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let shown = |record: &Option<Record>| match record {
+            Some(record) => record.to_string(),
+            None => "nothing".to_owned(),
+        };
+        match self {
+            Self::Equal {
+                records_per_federate,
+            } => {
+                let total: usize = records_per_federate.values().sum();
+                write!(f, "equal: {total} records")
+            }
+            Self::Different {
+                federate,
+                left,
+                right,
+            } => {
+                writeln!(f, "different, first in `{federate}`:")?;
+                write!(
+                    f,
+                    "  first run:  {}\n  second run: {}",
+                    shown(left),
+                    shown(right)
+                )
+            }
+            Self::NotComparable { why } => write!(f, "not comparable: {why}"),
+        }
+    }
+}
+
+/// The files of a folder with an extension, sorted.
+pub(crate) fn files(dir: &Path, extension: &str) -> std::io::Result<Vec<PathBuf>> {
+    let mut files = Vec::new();
+    for entry in std::fs::read_dir(dir)? {
+        let path = entry?.path();
+        if path.extension().is_some_and(|have| have == extension) {
+            files.push(path);
+        }
+    }
+    files.sort();
+    Ok(files)
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    fn set(files: &[(&str, &str)]) -> TraceSet {
+        let mut set = TraceSet::default();
+        for (stem, text) in files {
+            set.add(stem, &text.replace(' ', "\t").replace("#\t", "# "))
+                .unwrap();
+        }
+        set.sort();
+        set
+    }
+
+    const A: &str = "0 0 a 0 body out=0000000000000001\n5 0 a.x[1] 1 body -\n# end 9 0 timeout\n";
+    const B: &str = "5 0 b 0 body out=0000000000000002\n# end 9 0 timeout\n";
+
+    #[test]
+    fn order_of_lines_and_split_into_files_do_not_matter() {
+        let federated = set(&[("a", A), ("b", B)]);
+        let backwards: Vec<&str> = A.lines().rev().collect();
+        let together = set(&[("all", &format!("{}\n{B}", backwards.join("\n")))]);
+        assert_eq!(federated.hash(), together.hash());
+        let counts = [("a".to_owned(), 2), ("b".to_owned(), 1)].into();
+        assert_eq!(
+            compare(&federated, &together),
+            Verdict::Equal {
+                records_per_federate: counts
+            }
+        );
+    }
+
+    #[test]
+    fn the_first_difference_is_the_one_at_the_lowest_tag() {
+        let left = set(&[("a", A), ("b", B)]);
+        let right = set(&[
+            ("a", &A.replace("5 0 a.x", "4 0 a.x")),
+            ("b", &B.replace("02", "03")),
+        ]);
+        assert_ne!(left.hash(), right.hash());
+        let verdict = compare(&left, &right);
+        let Verdict::Different {
+            federate,
+            left: Some(one),
+            right: Some(other),
+        } = &verdict
+        else {
+            panic!("{verdict}")
+        };
+        assert_eq!(
+            (federate.as_str(), one.tag.time_ns, other.tag.time_ns),
+            ("a", 5, 4)
+        );
+        assert_eq!(
+            verdict.to_string(),
+            "different, first in `a`:\n  first run:  (5 ns, 0) a.x[1] #1 body -\n  second run: (4 \
+             ns, 0) a.x[1] #1 body -"
+        );
+    }
+
+    #[test]
+    fn what_no_run_repeats_is_not_comparable() {
+        let why =
+            |left: &str, right: &str| match compare(&set(&[("a", left)]), &set(&[("a", right)])) {
+                Verdict::NotComparable { why } => why,
+                verdict @ (Verdict::Equal { .. } | Verdict::Different { .. }) => {
+                    panic!("{verdict}")
+                }
+            };
+        assert!(why(A, &A.replace("# end 9 0 timeout\n", "")).contains("cut off"));
+        assert!(why(A, &A.replace("1 body", "1 deadline")).contains("deadline"));
+        let physical = format!("# physical 5 0 a.button\n{}", A.replace("5 0", "6 0"));
+        assert!(why(A, &physical).contains("a.button at (5 ns, 0)"));
+        assert!(why(A, &format!("# stop 5 0\n{}", A.replace("5 0", "6 0"))).contains("by request"));
+        let undigested = A.replace("=0000000000000001", "=?");
+        assert!(why(&undigested, &undigested).contains("no digest"));
+    }
+
+    #[test]
+    fn lines_that_are_no_records_are_named() {
+        let mut set = TraceSet::default();
+        assert_eq!(
+            set.add("a", "# header\n0\t0\ta\t0\tbody\t-\n0\t0\n"),
+            Err((3, "no path"))
+        );
+        assert_eq!(set.add("a", "x"), Err((1, "no time")));
+        assert_eq!(set.add("a", "0\t0\ta\t0\tmind\t-").map_err(|e| e.0), Err(1));
+    }
+
+    proptest! {
+        #[test]
+        fn reading_never_panics(text in "[0-9a-z#\t\n .\\[=?,-]{0,200}") {
+            let mut set = TraceSet::default();
+            if set.add("a", &text).is_ok() {
+                set.sort();
+                let twice = compare(&set, &set);
+                let different = matches!(twice, Verdict::Different { .. });
+                prop_assert!(!different, "{twice}");
+            }
+        }
+    }
 }

@@ -3,7 +3,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use ictus_coord::describe::PortDescription;
+use ictus_coord::describe::{ClassDescription, PortDescription};
 use ictus_coord::plan::{ConnectionPlan, Endpoint};
 
 use crate::federation::Member;
@@ -96,7 +96,7 @@ impl<'a> Wiring<'a, '_> {
             }
             let to = self.end(target, Side::To, &path);
             if let (Some(from), Some(to)) = (&from, to) {
-                self.join(entry, connection, from, &to, &path);
+                self.join(entry, connection, (from, &to), &path);
             }
         }
     }
@@ -137,43 +137,23 @@ impl<'a> Wiring<'a, '_> {
         let Some(description) = &member.description else {
             return Some(end);
         };
-        let (right, wrong) = match side {
-            Side::From => (&description.outputs, &description.inputs),
-            Side::To => (&description.inputs, &description.outputs),
-        };
-        let Some(found) = right.iter().find(|known| known.name == port) else {
-            let (code, message, fix) = match wrong.iter().any(|known| known.name == port) {
-                true if side == Side::From => {
-                    let message = format!("`{text}` is an input: a connection starts at an output");
-                    ("F013", message, ends_fix(federate, right, "an output"))
-                }
-                true => {
-                    let message = format!("`{text}` is an output: a connection ends at an input");
-                    ("F013", message, ends_fix(federate, right, "an input"))
-                }
-                false => {
-                    let kind = if side == Side::From {
-                        "output"
-                    } else {
-                        "input"
-                    };
-                    let fix = suggest::fix(port, right.iter().map(|known| known.name.as_str()));
-                    ("F012", format!("`{federate}` has no {kind} `{port}`"), fix)
-                }
-            };
-            self.report.add(code, place(), message, fix);
-            return None;
-        };
+        let found = self.port(&end, side, description, path)?;
         let width = found.width.unwrap_or(1);
         if end.first >= width {
-            let message = match found.width {
-                Some(width) => format!("`{federate}.{port}` has {width} channels, from 0"),
-                None => format!("`{federate}.{port}` is not a multiport"),
-            };
-            let fix = match found.width {
-                Some(0) => "its width is 0: give the federate other parameters".to_owned(),
-                Some(width) => format!("use a channel up to {}", width - 1),
-                None => format!("write `{federate}.{port}`"),
+            let name = format!("{federate}.{port}");
+            let (message, fix) = match found.width {
+                Some(0) => (
+                    format!("`{name}` has no channels"),
+                    "give the federate parameters that make it wider".to_owned(),
+                ),
+                Some(width) => (
+                    format!("`{name}` has {width} channels, from 0"),
+                    format!("use a channel up to {}", width - 1),
+                ),
+                None => (
+                    format!("`{name}` is not a multiport"),
+                    format!("write `{name}`"),
+                ),
             };
             self.report.add("F017", place(), message, fix);
             return None;
@@ -185,12 +165,52 @@ impl<'a> Wiring<'a, '_> {
         Some(end)
     }
 
+    /// Finds a port among those that may stand at this side.
+    fn port(
+        &mut self,
+        end: &End<'_>,
+        side: Side,
+        description: &'a ClassDescription,
+        path: &[String],
+    ) -> Option<&'a PortDescription> {
+        let (right, wrong, kind) = match side {
+            Side::From => (&description.outputs, &description.inputs, "output"),
+            Side::To => (&description.inputs, &description.outputs, "input"),
+        };
+        let (federate, port) = (end.name, end.port);
+        let found = right.iter().find(|known| known.name == port);
+        if found.is_some() {
+            return found;
+        }
+        let place = Place::value(path);
+        if wrong.iter().any(|known| known.name == port) {
+            let message = match side {
+                Side::From => {
+                    format!("`{federate}.{port}` is an input: a connection starts at an output")
+                }
+                Side::To => {
+                    format!("`{federate}.{port}` is an output: a connection ends at an input")
+                }
+            };
+            self.report
+                .add("F013", place, message, ends_fix(federate, right, kind));
+        } else {
+            let fix = suggest::fix(port, right.iter().map(|known| known.name.as_str()));
+            self.report.add(
+                "F012",
+                place,
+                format!("`{federate}` has no {kind} `{port}`"),
+                fix,
+            );
+        }
+        None
+    }
+
     fn join(
         &mut self,
         entry: usize,
         connection: &Connection,
-        from: &End<'_>,
-        to: &End<'_>,
+        (from, to): (&End<'_>, &End<'_>),
         path: &[String],
     ) {
         if !self.fit(from, to, path) {
