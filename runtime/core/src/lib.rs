@@ -21,5 +21,5 @@ pub use program::{
     ReactionSpec, Trigger,
 };
 pub use tag::{Delay, Tag};
-pub use time::{Duration, DurationExt, LogicalTime, PhysicalTime};
+pub use time::{Duration, DurationExt, LogicalTime, ParseDurationError, PhysicalTime};
 pub use timeline::{Admission, Effects, Progress, Scheduled, Timeline};

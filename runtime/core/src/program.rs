@@ -613,6 +613,11 @@ impl Program {
         &self.reactors[reactor.index()].path
     }
 
+    /// The paths of all reactors, by id.
+    pub fn reactor_paths(&self) -> impl Iterator<Item = &str> {
+        self.reactors.iter().map(|reactor| reactor.path.as_str())
+    }
+
     /// The level of a node: the longest chain of nodes before it.
     #[must_use]
     pub fn level(&self, node: NodeId) -> u32 {

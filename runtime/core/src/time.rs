@@ -228,3 +228,6 @@ impl PhysicalTime {
         LogicalTime(self.0)
     }
 }
+
+mod text;
+pub use text::ParseDurationError;

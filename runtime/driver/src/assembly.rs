@@ -1,10 +1,17 @@
 //! From a plan to something that runs: instances, connections, bodies.
 
-use crate::bodies::Bodies;
+use crate::bodies::{Bodies, Counters};
 use crate::class::Class;
 use crate::clock::Clock;
-use ictus_coord::plan::Plan;
-use ictus_core::{Program, ProgramError};
+use crate::ctx::Ctx;
+use crate::linker::Linker;
+use crate::outside::Outside;
+use crate::parameters::ParameterError;
+use crate::scope::{DeclaredPort, Elaboration, WiringError};
+use crate::slot::Epoch;
+use ictus_coord::plan::{ConnectionPlan, Endpoint, FederatePlan, Plan};
+use ictus_core::{Delay, Duration, PortId, PortKind, Program, ProgramError, ReactorId, Tag};
+use std::rc::Rc;
 use std::sync::Arc;
 use thiserror::Error;
 
@@ -25,6 +32,75 @@ pub struct Assembly {
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum AssemblyError {
+    /// The plan has no federate with this id.
+    #[error("the plan has no federate {id}")]
+    NoFederate {
+        /// The id.
+        id: u16,
+    },
+    /// The federate is a foreign one: it has no class to instantiate.
+    #[error("federate {federate} is foreign: it has no class")]
+    Foreign {
+        /// The federate.
+        federate: String,
+    },
+    /// The program does not have the class.
+    #[error("federate {federate}: this program has no class `{class}`; it has {}", .known.join(", "))]
+    NoClass {
+        /// The federate.
+        federate: String,
+        /// The class.
+        class: String,
+        /// The program's classes.
+        known: Vec<String>,
+    },
+    /// The parameters are not usable.
+    #[error("federate {federate} (class {class}): {source}")]
+    Parameter {
+        /// The federate.
+        federate: String,
+        /// Its class.
+        class: String,
+        /// What is wrong.
+        source: ParameterError,
+    },
+    /// A connection names a port that does not exist, or one of the wrong kind.
+    #[error("federate {federate} (class {class}) has no {kind} `{port}`")]
+    NoPort {
+        /// The federate.
+        federate: String,
+        /// Its class.
+        class: String,
+        /// `input` or `output`, with the channel when it is out of range.
+        kind: &'static str,
+        /// The port with its channel.
+        port: String,
+    },
+    /// The ends of a connection have different types.
+    #[error("{from} ({from_type}) and {to} ({to_type}) have different types")]
+    Types {
+        /// The output.
+        from: String,
+        /// Its type.
+        from_type: String,
+        /// The input.
+        to: String,
+        /// Its type.
+        to_type: String,
+    },
+    /// The type of a port does not offer the connection's serializer.
+    #[error("{port}: its type {type_name} does not offer the serializer `{serializer}`")]
+    Serializer {
+        /// The port.
+        port: String,
+        /// Its type.
+        type_name: String,
+        /// The serializer.
+        serializer: String,
+    },
+    /// A mistake in a `#[connections]` function.
+    #[error(transparent)]
+    Wiring(#[from] WiringError),
     /// The parts do not fit together.
     #[error(transparent)]
     Program(#[from] ProgramError),
@@ -43,7 +119,238 @@ impl Assembly {
         classes: &[Class],
         clock: Arc<dyn Clock>,
     ) -> Result<Self, AssemblyError> {
-        let _ = (plan, mine, classes, clock);
-        Err(ProgramError::CausalityLoop { ports: Vec::new() }.into())
+        let mut assembler = Assembler::new(plan, clock);
+        for id in mine {
+            assembler.instantiate(*id, classes)?;
+        }
+        for index in 0..plan.connections.len() {
+            assembler.connect(index)?;
+        }
+        assembler.finish()
+    }
+}
+
+/// An assembly in the making.
+pub(crate) struct Assembler<'a> {
+    plan: &'a Plan,
+    clock: Arc<dyn Clock>,
+    outside: Arc<Outside>,
+    pub(crate) elaboration: Elaboration,
+    /// By federate id: its top-level reactor, when it is built here.
+    pub(crate) reactors: Vec<Option<ReactorId>>,
+    senders: Vec<Box<dyn crate::carrier::Sender>>,
+    input_types: Vec<String>,
+    inputs: Vec<usize>,
+    outputs: Vec<usize>,
+}
+
+impl<'a> Assembler<'a> {
+    pub(crate) fn new(plan: &'a Plan, clock: Arc<dyn Clock>) -> Self {
+        let outside = Arc::new(Outside::new(Arc::clone(&clock)));
+        Self {
+            plan,
+            clock,
+            elaboration: Elaboration::new(Arc::clone(&outside)),
+            outside,
+            reactors: vec![None; plan.federates.len()],
+            senders: Vec::new(),
+            input_types: Vec::new(),
+            inputs: Vec::new(),
+            outputs: Vec::new(),
+        }
+    }
+
+    pub(crate) fn instantiate(&mut self, id: u16, classes: &[Class]) -> Result<(), AssemblyError> {
+        let no_federate = || AssemblyError::NoFederate { id };
+        let federates = &self.plan.federates;
+        let federate = federates.get(usize::from(id)).ok_or_else(no_federate)?;
+        let foreign = || AssemblyError::Foreign {
+            federate: federate.name.clone(),
+        };
+        let name = federate.class.as_ref().ok_or_else(foreign)?;
+        let class = classes.iter().find(|class| class.name() == name);
+        let class = class.ok_or_else(|| AssemblyError::NoClass {
+            federate: federate.name.clone(),
+            class: name.clone(),
+            known: classes.iter().map(|c| c.name().to_owned()).collect(),
+        })?;
+        let parameters = federate.parameters.clone();
+        let reactor = class.build(&mut self.elaboration, &federate.name, parameters);
+        let reactor = reactor.map_err(|source| AssemblyError::Parameter {
+            federate: federate.name.clone(),
+            class: name.clone(),
+            source,
+        })?;
+        self.reactors[usize::from(id)] = Some(reactor);
+        Ok(())
+    }
+
+    fn connect(&mut self, index: usize) -> Result<(), AssemblyError> {
+        let connection = &self.plan.connections[index];
+        let from = self.end(&connection.from, PortKind::Output)?;
+        let to = self.end(&connection.to, PortKind::Input)?;
+        match (from, to) {
+            (None, None) => {}
+            (Some(from), Some(to)) => self.connect_here(connection, &from, &to)?,
+            (Some(from), None) => {
+                let sender = from.typed.sender(from.port, &connection.serializer);
+                self.senders
+                    .push(sender.ok_or_else(|| self.no_serializer(connection, &from))?);
+                self.elaboration.program.network_output(from.port);
+                self.outputs.push(index);
+            }
+            (None, Some(to)) => {
+                let receiver = to.typed.receiver(to.port, &connection.serializer);
+                let receiver = receiver.ok_or_else(|| self.no_serializer(connection, &to))?;
+                let delayed = connection.after_ns.is_some();
+                self.elaboration.program.network_input(to.port, delayed);
+                self.elaboration.carriers.push(receiver);
+                self.input_types.push(to.typed.identity().name);
+                self.inputs.push(index);
+            }
+        }
+        Ok(())
+    }
+
+    fn connect_here(
+        &mut self,
+        connection: &ConnectionPlan,
+        from: &EndPort,
+        to: &EndPort,
+    ) -> Result<(), AssemblyError> {
+        let (from_type, to_type) = (from.typed.identity(), to.typed.identity());
+        if from_type != to_type {
+            return Err(AssemblyError::Types {
+                from: self.end_path(&connection.from),
+                from_type: from_type.name,
+                to: self.end_path(&connection.to),
+                to_type: to_type.name,
+            });
+        }
+        let delay = connection
+            .after_ns
+            .map_or(Delay::None, |ns| Delay::after(Duration::from_nanos(ns)));
+        self.elaboration
+            .connect((from.port, to.port), delay, &*from.typed);
+        Ok(())
+    }
+
+    /// The port at an end of a connection; `None` when its federate is elsewhere.
+    fn end(&self, endpoint: &Endpoint, kind: PortKind) -> Result<Option<EndPort>, AssemblyError> {
+        let id = endpoint.federate;
+        let place = self.reactors.get(usize::from(id));
+        let reactor = place.ok_or(AssemblyError::NoFederate { id })?;
+        let Some(reactor) = *reactor else {
+            return Ok(None);
+        };
+        let mut ports = self.elaboration.ports.iter();
+        let declared = ports
+            .find(|p| p.reactor == reactor && p.kind == kind && p.name == endpoint.port)
+            .and_then(|declared| EndPort::new(declared, endpoint.channel));
+        declared.map(Some).ok_or_else(|| AssemblyError::NoPort {
+            federate: self.federate(endpoint).name.clone(),
+            class: self.federate(endpoint).class.clone().unwrap_or_default(),
+            kind: match kind {
+                PortKind::Input => "input",
+                PortKind::Output => "output",
+            },
+            port: match endpoint.channel {
+                0 => endpoint.port.clone(),
+                channel => format!("{}[{channel}]", endpoint.port),
+            },
+        })
+    }
+
+    fn no_serializer(&self, connection: &ConnectionPlan, end: &EndPort) -> AssemblyError {
+        AssemblyError::Serializer {
+            port: self.end_path(match end.kind {
+                PortKind::Input => &connection.to,
+                PortKind::Output => &connection.from,
+            }),
+            type_name: end.typed.identity().name,
+            serializer: connection.serializer.clone(),
+        }
+    }
+
+    fn federate(&self, endpoint: &Endpoint) -> &'a FederatePlan {
+        &self.plan.federates[usize::from(endpoint.federate)]
+    }
+
+    fn end_path(&self, endpoint: &Endpoint) -> String {
+        format!("{}.{}", self.federate(endpoint).name, endpoint.port)
+    }
+
+    fn finish(self) -> Result<Assembly, AssemblyError> {
+        let Elaboration {
+            program,
+            mut bodies,
+            mut carriers,
+            physical,
+            errors,
+            ..
+        } = self.elaboration;
+        if let Some(error) = errors.into_iter().next() {
+            return Err(error.into());
+        }
+        let program = Arc::new(program.build()?);
+        let mut senders = self.senders;
+        let mut linker = Linker::new(&program);
+        for carrier in &mut carriers {
+            carrier.link(&mut linker);
+        }
+        for sender in &mut senders {
+            sender.link(&mut linker);
+        }
+        for entry in &mut bodies {
+            linker.reactor = Some(entry.reactor);
+            entry.body.link(&mut linker);
+        }
+        debug_assert_eq!(linker.mismatch, None, "connections were checked");
+        let ctx = Ctx {
+            tag: Tag::NEVER,
+            start: Tag::ZERO,
+            reactor: ReactorId::new(0),
+            stop: false,
+            clock: self.clock,
+            program: Arc::clone(&program),
+        };
+        let bodies = Bodies {
+            program: Arc::clone(&program),
+            ctx,
+            epoch: Epoch::default(),
+            bodies,
+            carriers,
+            senders,
+            input_types: self.input_types,
+            physical,
+            outside: self.outside,
+            observer: None,
+            counters: Counters::default(),
+            fault: None,
+        };
+        Ok(Assembly {
+            program,
+            bodies,
+            inputs: self.inputs,
+            outputs: self.outputs,
+        })
+    }
+}
+
+/// One channel of a top-level port.
+struct EndPort {
+    port: PortId,
+    kind: PortKind,
+    typed: Rc<dyn crate::carrier::PortType>,
+}
+
+impl EndPort {
+    fn new(declared: &DeclaredPort, channel: u32) -> Option<Self> {
+        let channel = usize::try_from(channel).ok()?;
+        Some(Self {
+            port: *declared.channels.get(channel)?,
+            kind: declared.kind,
+            typed: Rc::clone(&declared.typed),
+        })
     }
 }

@@ -1,15 +1,42 @@
 //! Values and reaction bodies: what the timeline decides about, executed.
 
+use crate::access::Outcome;
+use crate::carrier::{Carrier, Sender};
+use crate::ctx::Ctx;
+pub use crate::observe::Observation;
+use crate::observe::{Observer, Run};
 use crate::outside::{Outside, OutsideEvent};
+use crate::scope::BodyEntry;
+use crate::slot::Epoch;
 use ictus_coord::{FederateExecutor, PayloadError};
-use ictus_core::{ActionId, Effects, Executor, InputId, NodeId, OutputId, SlotId, Tag, ValueId};
-use std::path::PathBuf;
+use ictus_core::{
+    ActionId, Duration, Effects, Executor, InputId, NodeId, NodeKind, OutputId, PhysicalTime,
+    Program, Scheduled, SlotId, Tag, ValueId,
+};
+use std::any::Any;
+use std::fmt;
+use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
 
 /// All values and bodies of an [`Assembly`](crate::Assembly).
-#[derive(Debug)]
 pub struct Bodies {
-    outside: Arc<Outside>,
+    pub(crate) program: Arc<Program>,
+    pub(crate) ctx: Ctx,
+    pub(crate) epoch: Epoch,
+    /// By node id; reactions come first.
+    pub(crate) bodies: Vec<BodyEntry>,
+    /// By action id.
+    pub(crate) carriers: Vec<Box<dyn Carrier>>,
+    /// By output id.
+    pub(crate) senders: Vec<Box<dyn Sender>>,
+    /// The type names of network inputs, by input id.
+    pub(crate) input_types: Vec<String>,
+    /// Paths of the physical actions.
+    pub(crate) physical: Vec<(ActionId, String)>,
+    pub(crate) outside: Arc<Outside>,
+    pub(crate) observer: Option<Observer>,
+    pub(crate) counters: Counters,
+    pub(crate) fault: Option<Fault>,
 }
 
 /// A panic in a reaction, or a value that no serializer could write. Fatal: no further body runs.
@@ -17,7 +44,7 @@ pub struct Bodies {
 pub struct Fault {
     /// The reactor's path.
     pub path: String,
-    /// The reaction's name.
+    /// The reaction's name, or the output's.
     pub reaction: String,
     /// The tag at which it happened.
     pub tag: Tag,
@@ -34,62 +61,64 @@ pub struct Counters {
     pub deadlines_missed: u64,
 }
 
-/// Directories for trace and timing files; both exist.
-#[derive(Clone, Debug, Default)]
-pub struct Observation {
-    /// Where `FEDERATE.trace` goes.
-    pub trace: Option<PathBuf>,
-    /// Where `FEDERATE.timing` goes.
-    pub timing: Option<PathBuf>,
-}
-
 impl Bodies {
     /// Says where the start tag is; before [`Executor::begin`].
-    pub fn start(&mut self, start: Tag) {
-        let _ = start;
+    pub const fn start(&mut self, start: Tag) {
+        self.ctx.start = start;
     }
 
-    /// Opens trace and timing files, one per federate.
+    /// Opens trace and timing files, one per federate; before [`Bodies::start`] or after.
     ///
     /// # Errors
     ///
     /// When a file cannot be created.
     pub fn observe(&mut self, observation: &Observation) -> std::io::Result<()> {
-        let _ = observation;
+        self.observer = Observer::open(observation, &self.program)?;
         Ok(())
     }
 
     /// The first fault.
     #[must_use]
-    pub fn fault(&self) -> Option<&Fault> {
-        None
+    pub const fn fault(&self) -> Option<&Fault> {
+        self.fault.as_ref()
     }
 
     /// What was done so far.
     #[must_use]
-    pub fn counters(&self) -> Counters {
-        Counters::default()
+    pub const fn counters(&self) -> Counters {
+        self.counters
     }
 
     /// The queue of physical events.
     #[must_use]
-    pub fn outside(&self) -> &Arc<Outside> {
+    pub const fn outside(&self) -> &Arc<Outside> {
         &self.outside
     }
 
     /// Moves the queued physical events to `events`, in the order of their arrival.
     pub fn drain_outside(&mut self, events: &mut Vec<OutsideEvent>) {
-        let _ = events;
+        let sent = self.outside.take();
+        events.extend(sent.into_iter().map(|event| OutsideEvent {
+            action: event.action,
+            stamp: event.stamp,
+            value: self.carriers[event.action.index()].accept(event.value),
+        }));
     }
 
     /// Notes in the trace that a physical event got `tag`.
     pub fn note_physical(&mut self, action: ActionId, tag: Tag) {
-        let _ = (action, tag);
+        if let Some(observer) = &mut self.observer
+            && let Some((_, path)) = self.physical.iter().find(|(a, _)| *a == action)
+        {
+            observer.physical(self.ctx.start, tag, path);
+        }
     }
 
     /// Notes in the trace a stop by request.
     pub fn note_stop(&mut self, tag: Tag) {
-        let _ = tag;
+        if let Some(observer) = &mut self.observer {
+            observer.stop(self.ctx.start, tag);
+        }
     }
 
     /// Ends and flushes trace and timing: the last completed tag and why (one line).
@@ -98,29 +127,158 @@ impl Bodies {
     ///
     /// When a file could not be written, now or earlier.
     pub fn note_end(&mut self, tag: Tag, reason: &str) -> std::io::Result<()> {
-        let _ = (tag, reason);
-        Ok(())
+        match self.observer.take() {
+            Some(observer) => observer.end(self.ctx.start, tag, reason),
+            None => Ok(()),
+        }
+    }
+
+    #[inline]
+    fn react(&mut self, node: NodeId, effects: &mut Effects) {
+        if self.fault.is_some() {
+            return;
+        }
+        let entry = &mut self.bodies[node.index()];
+        self.ctx.reactor = entry.reactor;
+        let late = match entry.deadline {
+            Some(deadline) => self.ctx.lag() > deadline,
+            None => false,
+        };
+        self.counters.reactions += 1;
+        self.counters.deadlines_missed += u64::from(late);
+        if self.observer.is_some() {
+            self.react_observed(node, late, effects);
+            return;
+        }
+        let mut outcome = Outcome {
+            effects,
+            trace: None,
+        };
+        let (ctx, epoch) = (&mut self.ctx, self.epoch);
+        let run = AssertUnwindSafe(|| entry.body.run(ctx, epoch, late, &mut outcome));
+        if let Err(panic) = catch_unwind(run) {
+            self.fail(node, &*panic);
+        }
+        effects.stop |= std::mem::take(&mut self.ctx.stop);
+    }
+
+    #[cold]
+    fn react_observed(&mut self, node: NodeId, late: bool, effects: &mut Effects) {
+        let entry = &mut self.bodies[node.index()];
+        let start = self.ctx.clock.now();
+        let mut trace = String::new();
+        let mut outcome = Outcome {
+            effects,
+            trace: Some(&mut trace),
+        };
+        let (ctx, epoch) = (&mut self.ctx, self.epoch);
+        let run = AssertUnwindSafe(|| entry.body.run(ctx, epoch, late, &mut outcome));
+        let result = catch_unwind(run);
+        let end = self.ctx.clock.now();
+        match result {
+            Ok(()) => self.record(node, late, &trace, (start, end)),
+            Err(panic) => self.fail(node, &*panic),
+        }
+        effects.stop |= std::mem::take(&mut self.ctx.stop);
+    }
+
+    fn record(
+        &mut self,
+        node: NodeId,
+        late: bool,
+        effects: &str,
+        (start, end): (PhysicalTime, PhysicalTime),
+    ) {
+        let reaction = &self.program.reactions()[node.index()];
+        if let Some(observer) = &mut self.observer {
+            observer.run(&Run {
+                origin: self.ctx.start,
+                tag: self.ctx.tag,
+                reactor: reaction.spec.reactor,
+                path: self.program.reactor_path(reaction.spec.reactor),
+                index: reaction.index,
+                late,
+                effects,
+                start,
+                end,
+            });
+        }
+    }
+
+    #[cold]
+    fn fail(&mut self, node: NodeId, panic: &(dyn Any + Send)) {
+        let spec = &self.program.reactions()[node.index()].spec;
+        let text = panic.downcast_ref::<&str>().map(|text| (*text).to_owned());
+        let text = text.or_else(|| panic.downcast_ref::<String>().cloned());
+        self.fault = Some(Fault {
+            path: self.program.reactor_path(spec.reactor).to_owned(),
+            reaction: spec.name.clone(),
+            tag: self.ctx.tag,
+            message: text.unwrap_or_else(|| "a panic without words".to_owned()),
+        });
     }
 }
 
 impl Executor for Bodies {
+    #[inline]
     fn begin(&mut self, tag: Tag) {
-        let _ = tag;
+        self.ctx.tag = tag;
+        self.epoch.advance();
     }
-    fn arrive(&mut self, action: ActionId, slot: Option<SlotId>, value: ValueId) {
-        let _ = (action, slot, value);
+
+    #[inline]
+    fn arrive(&mut self, action: ActionId, _: Option<SlotId>, value: ValueId) {
+        self.carriers[action.index()].arrive(value, self.epoch);
     }
-    fn run(&mut self, node: NodeId, tag: Tag, effects: &mut Effects) {
-        let _ = (node, tag, effects);
+
+    #[inline]
+    fn run(&mut self, node: NodeId, _: Tag, effects: &mut Effects) {
+        match self.program.node(node) {
+            NodeKind::Reaction => self.react(node, effects),
+            NodeKind::Forward { action } => {
+                let value = self.carriers[action.index()].forward();
+                effects.scheduled.push(Scheduled {
+                    action,
+                    delay: Duration::ZERO,
+                    value,
+                });
+            }
+            // The value stays in its slot; the federate asks for its bytes with `encode`.
+            NodeKind::Send { .. } => {}
+        }
     }
 }
 
 impl FederateExecutor for Bodies {
     fn encode(&mut self, output: OutputId, out: &mut Vec<u8>) {
-        let _ = (output, out);
+        if let Err(error) = self.senders[output.index()].encode(out) {
+            let port = self.program.network_outputs()[output.index()];
+            self.fault.get_or_insert_with(|| Fault {
+                path: self.program.port_path(port),
+                reaction: "output".to_owned(),
+                tag: self.ctx.tag,
+                message: error.to_string(),
+            });
+        }
     }
+
     fn decode(&mut self, input: InputId, payload: &[u8]) -> Result<ValueId, PayloadError> {
-        let _ = (input, payload);
-        Ok(ValueId::NONE)
+        let network = self.program.network_inputs()[input.index()];
+        let carrier = &mut self.carriers[network.action.index()];
+        carrier.decode(payload).map_err(|error| PayloadError {
+            input: self.program.port_path(network.port),
+            type_name: self.input_types[input.index()].clone(),
+            length: payload.len(),
+            reason: error.to_string(),
+        })
+    }
+}
+
+impl fmt::Debug for Bodies {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Bodies")
+            .field("bodies", &self.bodies.len())
+            .field("fault", &self.fault)
+            .finish_non_exhaustive()
     }
 }

@@ -5,9 +5,10 @@
 
 use crate::args::{self, Command, RunArgs, USAGE};
 use crate::assembly::Assembly;
-use crate::bodies::{Bodies, Observation};
+use crate::bodies::Bodies;
 use crate::class::Class;
 use crate::clock::{Clock, SystemClock};
+use crate::observe::Observation;
 use crate::outside::OutsideEvent;
 use crate::status::Status;
 use crate::transport::{self, Connection, Signals, Waker};
@@ -276,7 +277,7 @@ impl Runner<'_> {
         let waker = self.io.waker.clone();
         self.bodies
             .outside()
-            .on_event(Arc::new(move || waker.wake()));
+            .on_event(Box::new(move || waker.wake()));
         let mut now = self.clock.now();
         self.federate.connect();
         if self.io.connection.is_none() {

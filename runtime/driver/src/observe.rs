@@ -1,0 +1,166 @@
+//! Trace and timing files: what was executed, line by line. The formats stand in ARCHITECTURE.md.
+
+use ictus_core::{PhysicalTime, Program, ReactorId, Tag};
+use std::fs::File;
+use std::io::{self, BufWriter, Write};
+use std::path::{Path, PathBuf};
+
+/// Directories for trace and timing files; both exist.
+#[derive(Clone, Debug, Default)]
+pub struct Observation {
+    /// Where `FEDERATE.trace` goes.
+    pub trace: Option<PathBuf>,
+    /// Where `FEDERATE.timing` goes.
+    pub timing: Option<PathBuf>,
+}
+
+/// Writes the files of all federates of the process. The first error stays until the end.
+#[derive(Debug)]
+pub(crate) struct Observer {
+    federates: Vec<Files>,
+    /// By reactor id: index into `federates`.
+    federate_of: Vec<usize>,
+    failure: Option<io::Error>,
+}
+
+#[derive(Debug)]
+struct Files {
+    name: String,
+    trace: Option<BufWriter<File>>,
+    timing: Option<BufWriter<File>>,
+}
+
+/// One run of a reaction.
+#[derive(Debug)]
+pub(crate) struct Run<'a> {
+    pub(crate) origin: Tag,
+    pub(crate) tag: Tag,
+    pub(crate) reactor: ReactorId,
+    pub(crate) path: &'a str,
+    pub(crate) index: u32,
+    pub(crate) late: bool,
+    pub(crate) effects: &'a str,
+    pub(crate) start: PhysicalTime,
+    pub(crate) end: PhysicalTime,
+}
+
+impl Observer {
+    /// Creates the files, or `None` when none is wanted.
+    pub(crate) fn open(observation: &Observation, program: &Program) -> io::Result<Option<Self>> {
+        let Observation { trace, timing } = observation;
+        if trace.is_none() && timing.is_none() {
+            return Ok(None);
+        }
+        let mut federates: Vec<Files> = Vec::new();
+        let mut federate_of = Vec::new();
+        for path in program.reactor_paths() {
+            let name = federate_name(path);
+            let known = federates.iter().position(|f| f.name == name);
+            federate_of.push(known.unwrap_or(federates.len()));
+            if known.is_none() {
+                federates.push(Files {
+                    name: name.to_owned(),
+                    trace: create(trace.as_deref(), name, "trace")?,
+                    timing: create(timing.as_deref(), name, "timing")?,
+                });
+            }
+        }
+        Ok(Some(Self {
+            federates,
+            federate_of,
+            failure: None,
+        }))
+    }
+
+    pub(crate) fn run(&mut self, run: &Run<'_>) {
+        let files = &mut self.federates[self.federate_of[run.reactor.index()]];
+        let result = files.run(run);
+        self.keep(result);
+    }
+
+    pub(crate) fn physical(&mut self, origin: Tag, tag: Tag, path: &str) {
+        let (time, microstep) = (tag.time.since(origin.time).as_nanos(), tag.microstep);
+        let name = federate_name(path);
+        let federate = self.federates.iter_mut().find(|f| f.name == name);
+        if let Some(trace) = federate.and_then(|f| f.trace.as_mut()) {
+            let result = writeln!(trace, "# physical {time} {microstep} {path}");
+            self.keep(result);
+        }
+    }
+
+    pub(crate) fn stop(&mut self, origin: Tag, tag: Tag) {
+        let (time, microstep) = (tag.time.since(origin.time).as_nanos(), tag.microstep);
+        let result = self
+            .traces()
+            .try_for_each(|trace| writeln!(trace, "# stop {time} {microstep}"));
+        self.keep(result);
+    }
+
+    pub(crate) fn end(mut self, origin: Tag, tag: Tag, reason: &str) -> io::Result<()> {
+        let (time, microstep) = (tag.time.since(origin.time).as_nanos(), tag.microstep);
+        let reason = reason.replace(['\n', '\r'], " ");
+        let result = self.traces().try_for_each(|trace| {
+            writeln!(trace, "# end {time} {microstep} {reason}")?;
+            trace.flush()
+        });
+        self.keep(result);
+        let timings = self.federates.iter_mut().filter_map(|f| f.timing.as_mut());
+        let result = { timings }.try_for_each(Write::flush);
+        self.keep(result);
+        self.failure.map_or(Ok(()), Err)
+    }
+
+    fn traces(&mut self) -> impl Iterator<Item = &mut BufWriter<File>> {
+        self.federates.iter_mut().filter_map(|f| f.trace.as_mut())
+    }
+
+    fn keep(&mut self, result: io::Result<()>) {
+        if let Err(error) = result {
+            self.failure.get_or_insert(error);
+        }
+    }
+}
+
+impl Files {
+    fn run(&mut self, run: &Run<'_>) -> io::Result<()> {
+        let time = run.tag.time.since(run.origin.time).as_nanos();
+        let (microstep, path, index) = (run.tag.microstep, run.path, run.index);
+        if let Some(trace) = &mut self.trace {
+            let kind = if run.late { "deadline" } else { "body" };
+            let effects = if run.effects.is_empty() {
+                "-"
+            } else {
+                run.effects
+            };
+            writeln!(
+                trace,
+                "{time}\t{microstep}\t{path}\t{index}\t{kind}\t{effects}"
+            )?;
+        }
+        if let Some(timing) = &mut self.timing {
+            let origin = run.origin.time.as_physical();
+            let (start, end) = (run.start.since(origin), run.end.since(origin));
+            let (start, end) = (start.as_nanos(), end.as_nanos());
+            writeln!(
+                timing,
+                "{time}\t{microstep}\t{path}\t{index}\t{start}\t{end}"
+            )?;
+        }
+        Ok(())
+    }
+}
+
+/// The first element of a path: a federate is a top-level instance.
+fn federate_name(path: &str) -> &str {
+    path.split_once('.').map_or(path, |(first, _)| first)
+}
+
+fn create(
+    directory: Option<&Path>,
+    federate: &str,
+    extension: &str,
+) -> io::Result<Option<BufWriter<File>>> {
+    let path = directory.map(|directory| directory.join(format!("{federate}.{extension}")));
+    path.map(|path| File::create(path).map(BufWriter::new))
+        .transpose()
+}

@@ -1,0 +1,225 @@
+//! Runs reactors in this process, as fast as they go, with a clock that the test moves.
+
+use ictus::{Assembly, AssemblyError, Class, Clock, Fault, Observation};
+use ictus_coord::plan::{
+    ClockSync, ConnectionPlan, Coordination, Endpoint, FORMAT, FederatePlan, Plan,
+};
+use ictus_core::{
+    Duration, Effects, Executor, LogicalTime, NodeId, PhysicalTime, Progress, Tag, Timeline,
+    ValueId,
+};
+use std::path::Path;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicI64, Ordering};
+
+/// The start tag of every test.
+pub const START: Tag = Tag::at(1_000_000_000);
+
+/// A clock that stands still until it is moved.
+#[derive(Debug, Default)]
+pub struct TestClock(AtomicI64);
+
+impl TestClock {
+    pub fn set(&self, after_start: Duration) {
+        let time = START.time.as_nanos() + after_start.as_nanos();
+        self.0.store(time, Ordering::Relaxed);
+    }
+}
+
+impl Clock for TestClock {
+    fn now(&self) -> PhysicalTime {
+        PhysicalTime::from_nanos(self.0.load(Ordering::Relaxed))
+    }
+}
+
+/// A plan in the making: federates by name, connections by `federate.port[channel]`.
+pub struct World {
+    plan: Plan,
+    classes: Vec<Class>,
+    pub clock: Arc<TestClock>,
+    stop_after: Option<Duration>,
+}
+
+/// What a run left behind.
+pub struct Ran {
+    pub fault: Option<Fault>,
+    pub end: Tag,
+    pub deadlines_missed: u64,
+    /// Per federate, in the order of the plan: the trace without its last line.
+    pub traces: Vec<String>,
+}
+
+impl World {
+    pub fn new(classes: &[Class]) -> Self {
+        let clock = Arc::new(TestClock::default());
+        clock.set(Duration::ZERO);
+        Self {
+            plan: Plan {
+                ictus: FORMAT.to_owned(),
+                federation: "test".to_owned(),
+                coordination: Coordination::Centralized,
+                timeout_ns: None,
+                fast: true,
+                keepalive: false,
+                max_lead_ns: None,
+                clock_sync: ClockSync::Off,
+                extensions: true,
+                federates: Vec::new(),
+                connections: Vec::new(),
+            },
+            classes: classes.to_vec(),
+            clock,
+            stop_after: None,
+        }
+    }
+
+    /// One instance, named `main`, of one class.
+    pub fn of(class: Class) -> Self {
+        Self::new(&[class]).federate("main", class.name(), "{}")
+    }
+
+    pub fn federate(mut self, name: &str, class: &str, parameters: &str) -> Self {
+        self.plan.federates.push(FederatePlan {
+            name: name.to_owned(),
+            class: Some(class.to_owned()),
+            program: None,
+            parameters: serde_json::from_str(parameters).unwrap(),
+        });
+        self
+    }
+
+    pub fn connect(mut self, from: &str, to: &str, after: Option<Duration>) -> Self {
+        let port_id = u16::try_from(self.plan.connections.len()).unwrap();
+        self.plan.connections.push(ConnectionPlan {
+            from: self.endpoint(from),
+            to: self.endpoint(to),
+            after_ns: after.map(Duration::as_nanos),
+            serializer: "native".to_owned(),
+            port_id,
+        });
+        self
+    }
+
+    fn endpoint(&self, text: &str) -> Endpoint {
+        let (federate, port) = text.split_once('.').unwrap();
+        let (port, channel) = port.split_once('[').map_or((port, 0), |(port, rest)| {
+            (port, rest.trim_end_matches(']').parse().unwrap())
+        });
+        let index = self.plan.federates.iter().position(|f| f.name == federate);
+        Endpoint {
+            federate: u16::try_from(index.unwrap()).unwrap(),
+            port: port.to_owned(),
+            channel,
+        }
+    }
+
+    pub fn timeout(mut self, after: Duration) -> Self {
+        self.stop_after = Some(after);
+        self
+    }
+
+    pub fn assemble(&self) -> Result<Assembly, AssemblyError> {
+        let mine: Vec<u16> = (0..u16::try_from(self.plan.federates.len()).unwrap()).collect();
+        self.assemble_some(&mine)
+    }
+
+    pub fn assemble_some(&self, mine: &[u16]) -> Result<Assembly, AssemblyError> {
+        let clock = Arc::clone(&self.clock);
+        Assembly::new(&self.plan, mine, &self.classes, clock)
+    }
+
+    pub fn run(&self) -> Ran {
+        let mut assembly = self.assemble().unwrap_or_else(|error| panic!("{error}"));
+        self.run_assembly(&mut assembly)
+    }
+
+    /// Runs to the stop tag, or until nothing is left.
+    pub fn run_assembly(&self, assembly: &mut Assembly) -> Ran {
+        let dir = tempfile::tempdir().unwrap();
+        let bodies = &mut assembly.bodies;
+        bodies
+            .observe(&Observation {
+                trace: Some(dir.path().to_owned()),
+                timing: None,
+            })
+            .unwrap();
+        bodies.start(START);
+        let stop = self.stop_after.map_or(Tag::FOREVER, |after| {
+            Tag::new(START.time.saturating_add(after), 0)
+        });
+        let mut timeline = Timeline::new(Arc::clone(&assembly.program));
+        timeline.start(START, stop);
+        drive(&mut timeline, bodies);
+        let end = timeline.at();
+        bodies.note_end(end, "test").unwrap();
+        Ran {
+            fault: bodies.fault().cloned(),
+            end,
+            deadlines_missed: bodies.counters().deadlines_missed,
+            traces: self
+                .plan
+                .federates
+                .iter()
+                .map(|f| trace(dir.path(), &f.name))
+                .collect(),
+        }
+    }
+}
+
+/// The loop of one process, without waiting.
+fn drive(timeline: &mut Timeline, bodies: &mut ictus::Bodies) {
+    let mut effects = Effects::default();
+    let (mut batch, mut present) = (Vec::<NodeId>::new(), Vec::new());
+    let mut events = Vec::new();
+    let program = Arc::clone(timeline.program());
+    loop {
+        bodies.drain_outside(&mut events);
+        for event in events.drain(..) {
+            let tag =
+                timeline.schedule_physical(event.stamp, event.action, event.value, Tag::NEVER);
+            bodies.note_physical(event.action, tag);
+        }
+        let mut tag = timeline.next_tag();
+        if tag == Tag::FOREVER {
+            // Starvation: without keepalive, the tag after the last one is the stop tag.
+            tag = timeline.at().next_microstep().unwrap();
+            timeline.stop_at(tag);
+        }
+        bodies.begin(tag);
+        timeline.begin(tag, &mut present);
+        for (action, value) in present.drain(..) {
+            bodies.arrive(action, program.action_slot(action), value);
+        }
+        while timeline.ready(&mut batch) == Progress::Batch {
+            for node in &batch {
+                bodies.run(*node, tag, &mut effects);
+            }
+            timeline.finish(&batch, &mut effects);
+            batch.clear();
+            if std::mem::take(&mut effects.stop) {
+                timeline.stop_at(tag.next_microstep().unwrap());
+            }
+        }
+        timeline.complete();
+        if timeline.finished() || bodies.fault().is_some() {
+            return;
+        }
+    }
+}
+
+fn trace(directory: &Path, federate: &str) -> String {
+    let text = std::fs::read_to_string(directory.join(format!("{federate}.trace"))).unwrap();
+    let lines: Vec<&str> = text.lines().collect();
+    let (last, lines) = lines.split_last().unwrap();
+    assert!(last.starts_with("# end "), "{last}");
+    lines.iter().map(|line| format!("{line}\n")).collect()
+}
+
+/// A tag so long after the start.
+pub fn at(after_start: Duration, microstep: u32) -> Tag {
+    let time = START.time.saturating_add(after_start);
+    Tag::new(LogicalTime::from_nanos(time.as_nanos()), microstep)
+}
+
+/// A value that stands for none, for tests of carriers.
+pub const NO_VALUE: ValueId = ValueId::NONE;

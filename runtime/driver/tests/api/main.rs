@@ -1,0 +1,12 @@
+//! What reactors mean: one module a subject.
+#![allow(
+    clippy::unwrap_used,
+    clippy::panic,
+    missing_docs,
+    missing_debug_implementations,
+    unreachable_pub,
+    reason = "tests may fail loudly and are not documented item by item"
+)]
+
+mod harness;
+mod simple;
