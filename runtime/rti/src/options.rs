@@ -1,0 +1,347 @@
+//! The command line of LF's RTI, parsed by hand: its options have one dash, long names and several values.
+
+use std::ffi::OsString;
+use std::net::{IpAddr, Ipv4Addr};
+
+use ictus_coord::rti::RtiConfig;
+use ictus_core::Duration;
+
+/// LF's default port.
+pub const DEFAULT_PORT: u16 = 15045;
+/// LF's default federation id.
+pub const DEFAULT_FEDERATION: &str = "Unidentified Federation";
+/// LF's default number of clock exchanges; compiled into its federates.
+const DEFAULT_EXCHANGES: u32 = 10;
+
+const HELP: &str = "\
+Usage: ictus rti -n N [OPTION]...
+Coordinates one federation; takes the options of Lingua Franca's RTI.
+
+  -n, --number_of_federates N   how many federates join (required)
+  -i, --id ID                   the federation's id
+  -p, --port PORT               TCP port (default 15045; 0: any free one)
+      --bind ADDRESS            address to listen on (default 127.0.0.1)
+  -c, --clock_sync off|init|on [period NS] [exchanges-per-interval K]
+                                compare clocks while federates join (default off; `on` is `init`)
+  -d, --dnet_disabled           send no downstream next event tags
+  -m, --start-time-multiple VALUE UNIT
+                                round the start time up to a multiple
+      --status-fd FD            write one JSON object a line to this inherited descriptor
+  -v, --version
+  -h, --help";
+
+/// What a command line asks for.
+#[derive(Debug)]
+pub enum Command {
+    /// To run an RTI.
+    Run(Box<Options>),
+    /// To print this and exit.
+    Print(String),
+}
+
+/// How an RTI is to run.
+#[derive(Clone, Debug)]
+pub struct Options {
+    /// What the state machine is told.
+    pub config: RtiConfig,
+    /// The address to listen on.
+    pub bind: IpAddr,
+    /// The TCP port to listen on; 0: the system chooses one.
+    pub port: u16,
+    /// The inherited descriptor for status lines.
+    pub status_fd: Option<u32>,
+    /// What was asked for and is done differently, for people.
+    pub warnings: Vec<String>,
+}
+
+/// Why a command line makes no sense.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum UsageError {
+    /// An option that no RTI has.
+    #[error("unknown option `{0}`; see `ictus rti --help`")]
+    Unknown(String),
+    /// An option of LF's RTI that this one does not have.
+    #[error("`{option}` is not supported: {why}")]
+    Unsupported {
+        /// The option.
+        option: String,
+        /// What is missing.
+        why: &'static str,
+    },
+    /// An option stands last without its value.
+    #[error("`{0}` needs a value")]
+    Missing(String),
+    /// A value is not one that the option takes.
+    #[error("`{option}` takes {expected}, not `{value}`")]
+    Invalid {
+        /// The option.
+        option: String,
+        /// What it takes, in words.
+        expected: &'static str,
+        /// What it was given.
+        value: String,
+    },
+    /// The number of federates is not given.
+    #[error("`-n N` is missing: how many federates join?")]
+    NumberMissing,
+    /// An argument is not Unicode.
+    #[error("argument `{0}` is not valid Unicode")]
+    NotUnicode(String),
+}
+
+impl Options {
+    /// The defaults for a federation of `federates` federates on a free port of the loopback interface.
+    #[must_use]
+    pub fn new(federation: &str, federates: u16) -> Self {
+        Self {
+            config: RtiConfig::new(federation, federates),
+            bind: IpAddr::V4(Ipv4Addr::LOCALHOST),
+            port: 0,
+            status_fd: None,
+            warnings: Vec::new(),
+        }
+    }
+
+    /// Parses a command line (without the program's name).
+    ///
+    /// LF's parser swallows the option that follows the values of `-c`; this one does not.
+    ///
+    /// # Errors
+    ///
+    /// When an option is unknown, unsupported or has a wrong value, or the number of federates is missing.
+    pub fn parse(arguments: impl IntoIterator<Item = OsString>) -> Result<Command, UsageError> {
+        let arguments: Vec<String> = arguments
+            .into_iter()
+            .map(|argument| {
+                argument
+                    .into_string()
+                    .map_err(|argument| UsageError::NotUnicode(argument.display().to_string()))
+            })
+            .collect::<Result<_, _>>()?;
+        let mut parser = Parser {
+            arguments: arguments.into_iter().peekable(),
+            options: Self {
+                port: DEFAULT_PORT,
+                ..Self::new(DEFAULT_FEDERATION, 0)
+            },
+        };
+        while let Some(option) = parser.arguments.next() {
+            if let Some(text) = parser.take(&option)? {
+                return Ok(Command::Print(text));
+            }
+        }
+        if parser.options.config.federates == 0 {
+            return Err(UsageError::NumberMissing);
+        }
+        Ok(Command::Run(Box::new(parser.options)))
+    }
+}
+
+struct Parser {
+    arguments: std::iter::Peekable<std::vec::IntoIter<String>>,
+    options: Options,
+}
+
+impl Parser {
+    /// Takes one option with its values; gives a text when only that is wanted.
+    fn take(&mut self, option: &str) -> Result<Option<String>, UsageError> {
+        match option {
+            "-i" | "--id" => self.options.config.federation = self.federation(option)?,
+            "-n" | "--number_of_federates" => {
+                self.options.config.federates = self.number_of_federates(option)?;
+            }
+            "-p" | "--port" => self.options.port = self.number(option, "a port (0 to 65535)")?,
+            "--bind" => self.options.bind = self.number(option, "an IP address")?,
+            "-c" | "--clock_sync" => self.clock_sync(option)?,
+            "-d" | "--dnet_disabled" => self.options.config.dnet = false,
+            "-m" | "--start-time-multiple" => {
+                self.options.config.start_multiple = Some(self.multiple(option)?);
+            }
+            "--status-fd" => {
+                self.options.status_fd = Some(self.number(option, "a descriptor's number")?);
+            }
+            "-t" | "--tracing" => {
+                self.options
+                    .warnings
+                    .push("tracing is not supported: `-t` is ignored".to_owned());
+            }
+            "-v" | "--version" => {
+                return Ok(Some(format!("ictus rti {}", env!("CARGO_PKG_VERSION"))));
+            }
+            "-h" | "--help" => return Ok(Some(HELP.to_owned())),
+            "-a" | "--auth" => return unsupported(option, "there is no HMAC authentication"),
+            "-tls" => return unsupported(option, "there is no TLS"),
+            "-sst" => return unsupported(option, "there is no SST"),
+            "-nt" => return unsupported(option, "there are no transient federates"),
+            _ => return Err(UsageError::Unknown(option.to_owned())),
+        }
+        Ok(None)
+    }
+
+    fn value(&mut self, option: &str) -> Result<String, UsageError> {
+        self.arguments
+            .next()
+            .ok_or_else(|| UsageError::Missing(option.to_owned()))
+    }
+
+    fn number<T: std::str::FromStr>(
+        &mut self,
+        option: &str,
+        expected: &'static str,
+    ) -> Result<T, UsageError> {
+        let value = self.value(option)?;
+        value.parse().or_else(|_| invalid(option, expected, value))
+    }
+
+    fn federation(&mut self, option: &str) -> Result<String, UsageError> {
+        let value = self.value(option)?;
+        if value.len() > usize::from(u8::MAX) {
+            return invalid(option, "at most 255 bytes", value);
+        }
+        Ok(value)
+    }
+
+    fn number_of_federates(&mut self, option: &str) -> Result<u16, UsageError> {
+        let expected = "a number from 1 to 65534";
+        match self.number(option, expected)? {
+            number @ (0 | u16::MAX) => invalid(option, expected, number.to_string()),
+            number => Ok(number),
+        }
+    }
+
+    fn clock_sync(&mut self, option: &str) -> Result<(), UsageError> {
+        let mode = self.value(option)?;
+        let mut exchanges = DEFAULT_EXCHANGES;
+        while let Some(key) = self
+            .arguments
+            .next_if(|word| word == "period" || word == "exchanges-per-interval")
+        {
+            if key == "period" {
+                let _period: u64 = self.number(&key, "nanoseconds")?;
+            } else {
+                exchanges = self.number(&key, "a number")?;
+            }
+        }
+        self.options.config.clock_exchanges = match mode.as_str() {
+            "off" => 0,
+            "init" => exchanges,
+            "on" => {
+                let warning =
+                    "clocks are compared while federates join, not later: `-c on` is `-c init`";
+                self.options.warnings.push(warning.to_owned());
+                exchanges
+            }
+            _ => return invalid(option, "off, init or on", mode),
+        };
+        Ok(())
+    }
+
+    fn multiple(&mut self, option: &str) -> Result<Duration, UsageError> {
+        let value: i64 = self.number(option, "a number and a unit")?;
+        let unit = self.value(option)?;
+        let nanos = match unit.as_str() {
+            "ns" | "nsec" | "nsecs" => 1,
+            "us" | "usec" | "usecs" => 1_000,
+            "ms" | "msec" | "msecs" => 1_000_000,
+            "s" | "sec" | "secs" | "second" | "seconds" => 1_000_000_000,
+            "min" | "mins" | "minute" | "minutes" => 60_000_000_000,
+            _ => return invalid(option, "a unit (ns, us, ms, s, min)", unit),
+        };
+        match value.checked_mul(nanos) {
+            Some(nanos) if nanos > 0 => Ok(Duration::from_nanos(nanos)),
+            Some(_) | None => invalid(option, "a positive time", format!("{value} {unit}")),
+        }
+    }
+}
+
+fn unsupported<T>(option: &str, why: &'static str) -> Result<T, UsageError> {
+    Err(UsageError::Unsupported {
+        option: option.to_owned(),
+        why,
+    })
+}
+
+fn invalid<T>(option: &str, expected: &'static str, value: String) -> Result<T, UsageError> {
+    Err(UsageError::Invalid {
+        option: option.to_owned(),
+        expected,
+        value,
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn parse(line: &str) -> Result<Options, UsageError> {
+        match Options::parse(line.split_whitespace().map(OsString::from))? {
+            Command::Run(options) => Ok(*options),
+            Command::Print(text) => panic!("{text}"),
+        }
+    }
+
+    #[test]
+    fn the_launchers_line() {
+        let options = parse("-i 3fa9 -n 4 -c init exchanges-per-interval 10").unwrap();
+        assert_eq!(options.config.federation, "3fa9");
+        assert_eq!(options.config.federates, 4);
+        assert_eq!(options.config.clock_exchanges, 10);
+        assert_eq!(options.port, DEFAULT_PORT);
+        assert!(options.config.dnet);
+    }
+
+    #[test]
+    fn the_option_after_the_clock_counts() {
+        let options = parse("-c off -d -n 1").unwrap();
+        assert_eq!(options.config.clock_exchanges, 0);
+        assert!(!options.config.dnet);
+        let options = parse("-n 1 -c on period 5000000 exchanges-per-interval 3 -d").unwrap();
+        assert_eq!(options.config.clock_exchanges, 3);
+        assert!(!options.config.dnet);
+        assert_eq!(options.warnings.len(), 1);
+    }
+
+    #[test]
+    fn long_names_and_ours() {
+        let options =
+            parse("--number_of_federates 2 --port 0 --bind 0.0.0.0 --status-fd 3 -m 2 sec")
+                .unwrap();
+        assert_eq!((options.port, options.status_fd), (0, Some(3)));
+        assert_eq!(options.bind, IpAddr::V4(Ipv4Addr::UNSPECIFIED));
+        assert_eq!(options.config.start_multiple, Some(Duration::from_secs(2)));
+    }
+
+    #[test]
+    fn mistakes_are_named() {
+        let table = [
+            ("", "`-n N` is missing: how many federates join?"),
+            ("-n 0", "`-n` takes a number from 1 to 65534, not `0`"),
+            ("-n x", "`-n` takes a number from 1 to 65534, not `x`"),
+            ("-n", "`-n` needs a value"),
+            (
+                "-n 1 -c sometimes",
+                "`-c` takes off, init or on, not `sometimes`",
+            ),
+            (
+                "-n 1 -a",
+                "`-a` is not supported: there is no HMAC authentication",
+            ),
+            (
+                "-n 1 -nt 2",
+                "`-nt` is not supported: there are no transient federates",
+            ),
+            (
+                "-n 1 --wat",
+                "unknown option `--wat`; see `ictus rti --help`",
+            ),
+            (
+                "-n 1 -p 70000",
+                "`-p` takes a port (0 to 65535), not `70000`",
+            ),
+            ("-n 1 -m 0 ms", "`-m` takes a positive time, not `0 ms`"),
+        ];
+        for (line, expected) in table {
+            assert_eq!(parse(line).unwrap_err().to_string(), expected);
+        }
+    }
+}

@@ -1,0 +1,335 @@
+//! The loop: wait, read everything that is ready, decide once, write, say what happened.
+
+use std::io::{self, Read};
+use std::net::SocketAddr;
+use std::time::{Duration, SystemTime};
+
+use ictus_coord::rti::{ConnectionId, Disconnect, Rti, RtiEvent};
+use ictus_core::PhysicalTime;
+use mio::net::{TcpListener, UnixStream};
+use mio::{Events, Interest, Poll, Token};
+use signal_hook::consts::{SIGINT, SIGTERM};
+
+use crate::options::Options;
+use crate::socket::{Flushed, READ, Received, Socket};
+use crate::status::Status;
+
+const LISTENER: Token = Token(usize::MAX);
+const SIGNALS: Token = Token(usize::MAX - 1);
+/// Connections that have not said who they are, beyond those of the federates.
+const STRANGERS: usize = 256;
+/// When accepting fails (no descriptor is left), it is tried again after this long.
+const ACCEPT_AGAIN: Duration = Duration::from_millis(100);
+
+/// An RTI with its sockets.
+#[derive(Debug)]
+pub struct Server {
+    poll: Poll,
+    listener: Option<TcpListener>,
+    /// Whether connections may be waiting.
+    accepting: bool,
+    signals: Option<UnixStream>,
+    stop_requested: bool,
+    sockets: Vec<Option<Socket>>,
+    most_sockets: usize,
+    rti: Rti,
+    status: Status,
+    buffer: Vec<u8>,
+    port: u16,
+}
+
+/// Why a server cannot run. Fatal.
+#[derive(Debug, thiserror::Error)]
+pub enum BindError {
+    /// Another program listens there.
+    #[error("port {port} on {} is already in use; choose another with `-p`, or 0 for any", address.ip())]
+    InUse {
+        /// The address.
+        address: SocketAddr,
+        /// The port.
+        port: u16,
+    },
+    /// The address cannot be listened on.
+    #[error("cannot listen on {address}: {source}")]
+    Listen {
+        /// The address.
+        address: SocketAddr,
+        /// Why.
+        source: io::Error,
+    },
+    /// The system refuses to wait for sockets or signals.
+    #[error("cannot wait for events: {0}")]
+    Poll(#[from] io::Error),
+}
+
+impl Server {
+    /// Opens the listener and says so.
+    ///
+    /// # Errors
+    ///
+    /// When the address cannot be listened on.
+    pub fn bind(options: &Options, mut status: Status) -> Result<Self, BindError> {
+        let address = SocketAddr::new(options.bind, options.port);
+        let mut listener = TcpListener::bind(address).map_err(|source| {
+            if source.kind() == io::ErrorKind::AddrInUse {
+                BindError::InUse {
+                    address,
+                    port: options.port,
+                }
+            } else {
+                BindError::Listen { address, source }
+            }
+        })?;
+        let poll = Poll::new()?;
+        poll.registry()
+            .register(&mut listener, LISTENER, Interest::READABLE)?;
+        let port = listener.local_addr()?.port();
+        for warning in &options.warnings {
+            status.say(warning);
+        }
+        status.listening(port);
+        Ok(Self {
+            poll,
+            listener: Some(listener),
+            accepting: true,
+            signals: None,
+            stop_requested: false,
+            sockets: Vec::new(),
+            most_sockets: usize::from(options.config.federates) + STRANGERS,
+            rti: Rti::new(options.config.clone()),
+            status,
+            buffer: vec![0; 2 * READ],
+            port,
+        })
+    }
+
+    /// Lets SIGTERM and SIGINT stop the federation: the first in order, the second by failing it.
+    ///
+    /// # Errors
+    ///
+    /// When the system refuses signal handlers.
+    pub fn with_signals(mut self) -> Result<Self, BindError> {
+        let (receiver, sender) = std::os::unix::net::UnixStream::pair()?;
+        receiver.set_nonblocking(true)?;
+        let mut receiver = UnixStream::from_std(receiver);
+        self.poll
+            .registry()
+            .register(&mut receiver, SIGNALS, Interest::READABLE)?;
+        for signal in [SIGTERM, SIGINT] {
+            signal_hook::low_level::pipe::register(signal, sender.try_clone()?)?;
+        }
+        self.signals = Some(receiver);
+        Ok(self)
+    }
+
+    /// The port that is listened on.
+    #[must_use]
+    pub const fn port(&self) -> u16 {
+        self.port
+    }
+
+    /// Serves until the federation has ended and returns the exit code.
+    ///
+    /// # Errors
+    ///
+    /// When the system refuses to wait for events.
+    pub fn run(mut self) -> Result<u8, BindError> {
+        let mut events = Events::with_capacity(1024);
+        loop {
+            match self.poll.poll(&mut events, self.patience()) {
+                Ok(()) => {}
+                Err(error) if error.kind() == io::ErrorKind::Interrupted => continue,
+                Err(error) => return Err(error.into()),
+            }
+            let now = physical_time();
+            let woken = self.note(&events, now);
+            if self.accepting {
+                self.accept(now);
+            }
+            self.read_round(now);
+            if self
+                .rti
+                .poll_timeout()
+                .is_some_and(|deadline| deadline <= now)
+            {
+                self.rti.handle_timeout(now);
+            }
+            self.rti.drain(now);
+            self.write_round(&woken);
+            self.report();
+            if let Some(code) = self.rti.finished() {
+                self.status.flush();
+                return Ok(code);
+            }
+        }
+    }
+
+    /// How long nothing needs to be done; `None`: until an event.
+    fn patience(&self) -> Option<Duration> {
+        if self.sockets.iter().flatten().any(|socket| socket.readable) {
+            return Some(Duration::ZERO);
+        }
+        let accept = (self.accepting && self.listener.is_some()).then_some(ACCEPT_AGAIN);
+        let deadline = self
+            .rti
+            .poll_timeout()
+            .map(|deadline| deadline.since(physical_time()).to_std() + Duration::from_millis(1));
+        match (accept, deadline) {
+            (Some(a), Some(b)) => Some(a.min(b)),
+            (a, b) => a.or(b),
+        }
+    }
+
+    /// Notes what the events say; returns the connections that can take bytes again.
+    fn note(&mut self, events: &Events, now: PhysicalTime) -> Vec<ConnectionId> {
+        let mut writable = Vec::new();
+        for event in events {
+            match event.token() {
+                LISTENER => self.accepting = true,
+                SIGNALS => self.take_signals(now),
+                Token(index) => {
+                    let Some(Some(socket)) = self.sockets.get_mut(index) else {
+                        continue;
+                    };
+                    socket.readable |= event.is_readable() || event.is_error();
+                    socket.read_to_end |= event.is_read_closed() || event.is_error();
+                    if event.is_writable() {
+                        writable.push(ConnectionId::from_index(index));
+                    }
+                }
+            }
+        }
+        writable
+    }
+
+    fn take_signals(&mut self, now: PhysicalTime) {
+        let mut bytes = [0; 16];
+        let Some(signals) = &mut self.signals else {
+            return;
+        };
+        while let Ok(number @ 1..) = signals.read(&mut bytes) {
+            for _ in 0..number {
+                if self.stop_requested {
+                    self.status.say("a second signal: failing the federation");
+                    self.rti.abort(now);
+                } else {
+                    self.stop_requested = true;
+                    self.rti.request_stop(now);
+                }
+            }
+        }
+    }
+
+    fn accept(&mut self, now: PhysicalTime) {
+        while let Some(listener) = &self.listener {
+            let (stream, peer) = match listener.accept() {
+                Ok(accepted) => accepted,
+                Err(error) if passes(&error) => continue,
+                Err(error) if error.kind() == io::ErrorKind::WouldBlock => {
+                    self.accepting = false;
+                    return;
+                }
+                Err(error) => {
+                    self.status
+                        .say(&format!("cannot accept a connection: {error}"));
+                    return;
+                }
+            };
+            if self.sockets.iter().flatten().count() >= self.most_sockets {
+                self.status
+                    .say(&format!("refused {peer}: too many connections"));
+                continue;
+            }
+            self.add(stream, peer, now);
+        }
+    }
+
+    fn add(&mut self, mut stream: mio::net::TcpStream, peer: SocketAddr, now: PhysicalTime) {
+        let id = self.rti.connect(now, peer.to_string());
+        let interest = Interest::READABLE | Interest::WRITABLE;
+        let ready = stream.set_nodelay(true).and_then(|()| {
+            self.poll
+                .registry()
+                .register(&mut stream, Token(id.index()), interest)
+        });
+        if let Err(error) = ready {
+            self.rti
+                .disconnect(now, id, &Disconnect::Error(error.to_string()));
+            return;
+        }
+        if self.sockets.len() <= id.index() {
+            self.sockets.resize_with(id.index() + 1, || None);
+        }
+        self.sockets[id.index()] = Some(Socket::new(stream));
+    }
+
+    /// One read from every socket that may have something.
+    fn read_round(&mut self, now: PhysicalTime) {
+        for index in 0..self.sockets.len() {
+            let Some(socket) = &mut self.sockets[index] else {
+                continue;
+            };
+            if !socket.readable {
+                continue;
+            }
+            let id = ConnectionId::from_index(index);
+            if let Received::Ended(why) = socket.receive(&mut self.rti, now, id, &mut self.buffer) {
+                // A refusal may be waiting for a peer that has closed only its own half.
+                socket.flush(self.rti.output(id));
+                self.remove(id, now, &why);
+            }
+        }
+    }
+
+    fn write_round(&mut self, woken: &[ConnectionId]) {
+        for &id in woken {
+            self.flush(id);
+        }
+        while let Some(id) = self.rti.poll_output() {
+            self.flush(id);
+        }
+    }
+
+    fn flush(&mut self, id: ConnectionId) {
+        let Some(Some(socket)) = self.sockets.get_mut(id.index()) else {
+            return;
+        };
+        if socket.flush(self.rti.output(id)) == Flushed::Close {
+            self.remove(id, physical_time(), &Disconnect::Eof);
+        }
+    }
+
+    fn remove(&mut self, id: ConnectionId, now: PhysicalTime, why: &Disconnect) {
+        if let Some(mut socket) = self.sockets[id.index()].take() {
+            // Closing the socket deregisters it as well.
+            let _already = self.poll.registry().deregister(socket.stream_mut());
+        }
+        self.rti.disconnect(now, id, why);
+    }
+
+    fn report(&mut self) {
+        while let Some(event) = self.rti.poll_event() {
+            if matches!(event, RtiEvent::Ended { .. }) {
+                self.listener = None;
+            }
+            self.status.tell(event);
+        }
+        self.status.flush();
+    }
+}
+
+/// Whether an error concerns one connection, or none.
+fn passes(error: &io::Error) -> bool {
+    matches!(
+        error.kind(),
+        io::ErrorKind::Interrupted | io::ErrorKind::ConnectionAborted
+    )
+}
+
+/// The host's clock.
+fn physical_time() -> PhysicalTime {
+    let since_epoch = SystemTime::now()
+        .duration_since(SystemTime::UNIX_EPOCH)
+        .unwrap_or_default();
+    PhysicalTime::from_nanos(i64::try_from(since_epoch.as_nanos()).unwrap_or(i64::MAX))
+}

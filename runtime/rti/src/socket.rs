@@ -1,0 +1,165 @@
+//! One connection: bytes in to the state machine, bytes out of its output.
+
+use std::io::{ErrorKind, Read, Write};
+use std::net::Shutdown;
+
+use ictus_coord::rti::{Closing, ConnectionId, Disconnect, Output, Rti};
+use ictus_core::PhysicalTime;
+use mio::net::TcpStream;
+
+/// The most that is read from one socket before others have their turn (bytes).
+pub(crate) const READ: usize = 256 << 10;
+/// Leftovers up to this size are moved to the front of the shared buffer rather than read behind (bytes).
+const SMALL: usize = 64 << 10;
+
+/// A connection's socket and what it has sent of an incomplete message.
+#[derive(Debug)]
+pub(crate) struct Socket {
+    stream: TcpStream,
+    leftover: Vec<u8>,
+    /// More may be read without waiting for an event.
+    pub(crate) readable: bool,
+    /// The peer has closed its half, or the connection is broken: read to the end.
+    pub(crate) read_to_end: bool,
+    writing: Writing,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Writing {
+    Open,
+    /// We have closed our half.
+    Shut,
+    /// The peer takes nothing any more; what comes from it still counts.
+    Broken,
+}
+
+/// What a read came to.
+pub(crate) enum Received {
+    /// The connection goes on.
+    Open,
+    /// Everything up to its end was taken.
+    Ended(Disconnect),
+}
+
+/// What a flush came to.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Flushed {
+    /// The connection goes on.
+    Open,
+    /// It is to be closed at once.
+    Close,
+}
+
+impl Socket {
+    pub(crate) const fn new(stream: TcpStream) -> Self {
+        Self {
+            stream,
+            leftover: Vec::new(),
+            readable: true,
+            read_to_end: false,
+            writing: Writing::Open,
+        }
+    }
+
+    pub(crate) const fn stream_mut(&mut self) -> &mut TcpStream {
+        &mut self.stream
+    }
+
+    /// Reads once, at most [`READ`] bytes, and hands complete messages to the state machine.
+    pub(crate) fn receive(
+        &mut self,
+        rti: &mut Rti,
+        now: PhysicalTime,
+        id: ConnectionId,
+        buffer: &mut [u8],
+    ) -> Received {
+        if self.leftover.len() > SMALL {
+            return self.receive_behind(rti, now, id);
+        }
+        let kept = self.leftover.len();
+        buffer[..kept].copy_from_slice(&self.leftover);
+        let room = buffer.len() - kept;
+        let result = self.stream.read(&mut buffer[kept..]);
+        match self.judge(result, room) {
+            Ok(0) => Received::Open,
+            Ok(read) => {
+                let bytes = &buffer[..kept + read];
+                let taken = rti.receive(now, id, bytes);
+                self.leftover.clear();
+                self.leftover.extend_from_slice(&bytes[taken..]);
+                Received::Open
+            }
+            Err(end) => Received::Ended(end),
+        }
+    }
+
+    /// As [`Socket::receive`], for a message too long to be moved about.
+    fn receive_behind(&mut self, rti: &mut Rti, now: PhysicalTime, id: ConnectionId) -> Received {
+        let kept = self.leftover.len();
+        self.leftover.resize(kept + READ, 0);
+        let result = self.stream.read(&mut self.leftover[kept..]);
+        let judged = self.judge(result, READ);
+        self.leftover
+            .truncate(kept + judged.as_ref().map_or(0, |&read| read));
+        match judged {
+            Ok(0) => Received::Open,
+            Ok(_) => {
+                let taken = rti.receive(now, id, &self.leftover);
+                self.leftover.drain(..taken);
+                if self.leftover.len() <= SMALL {
+                    self.leftover.shrink_to(SMALL);
+                }
+                Received::Open
+            }
+            Err(end) => Received::Ended(end),
+        }
+    }
+
+    /// Whether more can be read at once; 0 bytes: not now. A short read has emptied the socket, unless its end is near.
+    fn judge(&mut self, result: std::io::Result<usize>, room: usize) -> Result<usize, Disconnect> {
+        match result {
+            Ok(0) => Err(Disconnect::Eof),
+            Ok(read) => {
+                self.readable = read == room || self.read_to_end;
+                Ok(read)
+            }
+            Err(error) if error.kind() == ErrorKind::Interrupted => Ok(0),
+            Err(error) if error.kind() == ErrorKind::WouldBlock => {
+                self.readable = false;
+                Ok(0)
+            }
+            Err(error) if error.kind() == ErrorKind::ConnectionReset => Err(Disconnect::Reset),
+            Err(error) => Err(Disconnect::Error(error.to_string())),
+        }
+    }
+
+    /// Writes what the socket takes, one whole chunk a call, then closes as the state machine wants it.
+    pub(crate) fn flush(&mut self, output: &mut Output) -> Flushed {
+        if output.closing() == Closing::Now {
+            return Flushed::Close;
+        }
+        while !output.chunk().is_empty() {
+            if self.writing == Writing::Broken {
+                output.advance(output.chunk().len());
+                continue;
+            }
+            match self.stream.write(output.chunk()) {
+                Ok(written) => output.advance(written),
+                Err(error) if error.kind() == ErrorKind::Interrupted => {}
+                Err(error) if error.kind() == ErrorKind::WouldBlock => return Flushed::Open,
+                Err(_) => {
+                    // What the peer sent before it went still counts: read on, to the end.
+                    self.writing = Writing::Broken;
+                    self.readable = true;
+                    self.read_to_end = true;
+                }
+            }
+        }
+        if output.closing() == Closing::AfterFlush && self.writing == Writing::Open {
+            self.writing = Writing::Shut;
+            // A peer that is gone already needs no farewell.
+            let _gone = self.stream.shutdown(Shutdown::Write);
+        }
+        Flushed::Open
+    }
+}

@@ -1,0 +1,356 @@
+//! The server over real sockets on the loopback interface.
+
+#![allow(clippy::unwrap_used, clippy::panic, missing_docs, reason = "a test")]
+
+use std::io::{BufRead, BufReader, Read, Write};
+use std::net::{Shutdown, SocketAddr, TcpListener, TcpStream};
+use std::thread::JoinHandle;
+use std::time::Duration;
+
+use ictus_coord::wire::{
+    NO_CLOCK_SYNC, NeighborStructure, RejectReason, TaggedMessage, ToFederate, ToRti,
+};
+use ictus_core::{Delay, PhysicalTime, Tag};
+use ictus_rti::{BindError, Options, Server, Status};
+
+/// No read of a test waits longer than this.
+const PATIENCE: Duration = Duration::from_secs(20);
+
+/// A server on a thread.
+struct Running {
+    address: SocketAddr,
+    thread: JoinHandle<u8>,
+}
+
+fn serve(options: Options) -> Running {
+    let server = Server::bind(&options, Status::default()).unwrap();
+    let address = SocketAddr::new(options.bind, server.port());
+    Running {
+        address,
+        thread: std::thread::spawn(move || server.run().unwrap()),
+    }
+}
+
+impl Running {
+    fn ended(self) -> u8 {
+        self.thread.join().unwrap()
+    }
+
+    fn connect(&self) -> Peer {
+        let stream = TcpStream::connect(self.address).unwrap();
+        stream.set_read_timeout(Some(PATIENCE)).unwrap();
+        stream.set_write_timeout(Some(PATIENCE)).unwrap();
+        stream.set_nodelay(true).unwrap();
+        Peer {
+            stream,
+            unread: Vec::new(),
+        }
+    }
+
+    /// Sends everything up to TIMESTAMP at once.
+    fn join(&self, federate: u16, upstream: &[u16], downstream: &[u16]) -> Peer {
+        let mut peer = self.connect();
+        peer.send(&[
+            ToRti::FederateIds {
+                federate,
+                federation: b"test",
+            },
+            ToRti::NeighborStructure(NeighborStructure {
+                upstream: upstream.iter().map(|&id| (id, Delay::None)).collect(),
+                downstream: downstream.to_vec(),
+            }),
+            ToRti::UdpPort(NO_CLOCK_SYNC),
+            ToRti::Capabilities(0),
+            ToRti::Timestamp(PhysicalTime::from_nanos(1_000_000_000)),
+        ]);
+        peer
+    }
+}
+
+struct Peer {
+    stream: TcpStream,
+    unread: Vec<u8>,
+}
+
+impl Peer {
+    fn send(&mut self, messages: &[ToRti<'_>]) {
+        let mut bytes = Vec::new();
+        for message in messages {
+            message.encode(&mut bytes);
+        }
+        self.stream.write_all(&bytes).unwrap();
+    }
+
+    /// The next message, told as text; `None` at the end.
+    fn next(&mut self) -> Option<String> {
+        loop {
+            if let Some((message, length)) = ToFederate::decode(&self.unread).unwrap() {
+                let told = format!("{message:?}");
+                self.unread.drain(..length);
+                return Some(told);
+            }
+            let mut buffer = [0; 4096];
+            let read = self.stream.read(&mut buffer).unwrap();
+            if read == 0 {
+                assert!(
+                    self.unread.is_empty(),
+                    "the stream ends with a whole message"
+                );
+                return None;
+            }
+            self.unread.extend_from_slice(&buffer[..read]);
+        }
+    }
+
+    /// Reads until a message that starts so.
+    fn wait_for(&mut self, start: &str) -> String {
+        loop {
+            let message = self
+                .next()
+                .unwrap_or_else(|| panic!("no {start} before the end"));
+            if message.starts_with(start) {
+                return message;
+            }
+        }
+    }
+
+    fn start(&mut self) -> i64 {
+        assert_eq!(self.next().unwrap(), "Ack");
+        let told = self.wait_for("Timestamp(");
+        told.trim_start_matches("Timestamp(")
+            .trim_end_matches(')')
+            .parse()
+            .unwrap()
+    }
+
+    fn resign(mut self) {
+        self.send(&[ToRti::NextEventTag(Tag::FOREVER), ToRti::Resign]);
+        self.stream.shutdown(Shutdown::Write).unwrap();
+        while self.next().is_some() {}
+    }
+}
+
+fn message(federate: u16, tag: Tag, payload: &[u8]) -> ToRti<'_> {
+    ToRti::TaggedMessage(TaggedMessage {
+        port: 0,
+        federate,
+        tag,
+        payload,
+    })
+}
+
+#[test]
+fn bad_bytes_hurt_nobody_else() {
+    let rti = serve(Options::new("test", 2));
+    // A stream of bytes that a fixed linear congruential generator makes.
+    let mut state = 7u32;
+    let mut strangers = Vec::new();
+    for length in 0..100usize {
+        let mut peer = rti.connect();
+        let bytes: Vec<u8> = (0..length)
+            .map(|_| {
+                state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+                state.to_le_bytes()[3]
+            })
+            .collect();
+        peer.stream.write_all(&bytes).unwrap();
+        strangers.push(peer);
+    }
+    let mut source = rti.join(0, &[], &[1]);
+    let mut half = rti.connect();
+    half.stream.write_all(&[1, 1, 0, 4, b't']).unwrap();
+    let mut wrong = rti.join(0, &[], &[]);
+    assert_eq!(
+        wrong.next().unwrap(),
+        format!("{:?}", ToFederate::Reject(RejectReason::FederateIdInUse))
+    );
+    assert_eq!(wrong.next(), None);
+    let mut sink = rti.join(1, &[0], &[]);
+    let start = source.start();
+    assert_eq!(sink.start(), start);
+    sink.send(&[ToRti::NextEventTag(Tag::at(start))]);
+    source.send(&[
+        message(1, Tag::at(start), b"hello"),
+        ToRti::NextEventTag(Tag::FOREVER),
+    ]);
+    assert!(
+        sink.wait_for("TaggedMessage")
+            .contains("[104, 101, 108, 108, 111]")
+    );
+    sink.wait_for("TagAdvanceGrant(FOREVER)");
+    source.resign();
+    sink.resign();
+    drop(strangers);
+    drop(half);
+    assert_eq!(rti.ended(), 0);
+}
+
+#[test]
+fn a_late_connection_is_refused_at_once() {
+    let rti = serve(Options::new("test", 1));
+    let mut only = rti.join(0, &[], &[]);
+    only.start();
+    let mut late = rti.connect();
+    assert_eq!(late.next().unwrap(), "Reject(FederationId)");
+    assert_eq!(late.next(), None);
+    only.resign();
+    assert_eq!(rti.ended(), 0);
+}
+
+#[test]
+fn a_slow_reader_blocks_nobody() {
+    const MESSAGES: usize = 2_000;
+    let rti = serve(Options::new("test", 4));
+    let mut flood = rti.join(0, &[], &[1]);
+    let mut slow = rti.join(1, &[0], &[]);
+    let mut source = rti.join(2, &[], &[3]);
+    let mut sink = rti.join(3, &[2], &[]);
+    let start = flood.start();
+    for peer in [&mut slow, &mut source, &mut sink] {
+        assert_eq!(peer.start(), start);
+    }
+    // More than the kernel keeps for a reader that does not read: 64 MB.
+    let payload = vec![42; 32 << 10];
+    for number in 0..MESSAGES {
+        let tag = Tag::at(start + i64::try_from(number).unwrap());
+        flood.send(&[message(1, tag, &payload)]);
+    }
+    sink.send(&[ToRti::NextEventTag(Tag::at(start))]);
+    for number in 0..100 {
+        let tag = Tag::at(start + number);
+        source.send(&[message(3, tag, b"quick"), ToRti::LatestTagConfirmed(tag)]);
+        sink.wait_for("TagAdvanceGrant");
+        sink.send(&[
+            ToRti::LatestTagConfirmed(tag),
+            ToRti::NextEventTag(Tag::at(start + number + 1)),
+        ]);
+    }
+    source.resign();
+    sink.resign();
+    flood.resign();
+    let mut received = 0;
+    slow.send(&[ToRti::NextEventTag(Tag::at(start))]);
+    while received < MESSAGES {
+        slow.wait_for("TaggedMessage");
+        received += 1;
+    }
+    slow.resign();
+    assert_eq!(rti.ended(), 0);
+}
+
+#[test]
+fn what_was_sent_before_a_reset_counts() {
+    const MESSAGES: i64 = 1_000;
+    let rti = serve(Options::new("test", 2));
+    let mut source = rti.join(0, &[], &[1]);
+    let mut sink = rti.join(1, &[0], &[]);
+    let start = source.start();
+    sink.start();
+    source.send(&[ToRti::NextEventTag(Tag::at(start))]);
+    sink.send(&[ToRti::NextEventTag(Tag::at(start))]);
+    // A DNET lies unread in the source's buffer: closing the socket resets the connection.
+    source.stream.peek(&mut [0]).unwrap();
+    let mut last: Vec<_> = (0..MESSAGES)
+        .map(|number| message(1, Tag::at(start + number), b"x"))
+        .collect();
+    last.extend([ToRti::NextEventTag(Tag::FOREVER), ToRti::Resign]);
+    source.send(&last);
+    drop(source);
+    for _ in 0..MESSAGES {
+        sink.wait_for("TaggedMessage");
+    }
+    sink.wait_for("TagAdvanceGrant(FOREVER)");
+    sink.resign();
+    assert_eq!(rti.ended(), 0);
+}
+
+#[test]
+fn control_messages_come_whole() {
+    let rti = serve(Options::new("test", 2));
+    let mut source = rti.join(0, &[], &[1]);
+    let mut sink = rti.join(1, &[0], &[]);
+    let start = source.start();
+    sink.start();
+    assert!(sink.unread.is_empty());
+    sink.send(&[ToRti::NextEventTag(Tag::at(start))]);
+    for number in 1..1000 {
+        source.send(&[ToRti::NextEventTag(Tag::at(start + number))]);
+        // A reader that takes what is there gets whole messages: 13 bytes each, never a part of one.
+        let mut buffer = [0; 64 << 10];
+        let read = sink.stream.read(&mut buffer).unwrap();
+        assert!(read > 0 && read.is_multiple_of(13), "{read}");
+    }
+    source.resign();
+    sink.resign();
+    assert_eq!(rti.ended(), 0);
+}
+
+#[test]
+fn a_vanished_federate_ends_the_federation() {
+    let rti = serve(Options::new("test", 2));
+    let mut source = rti.join(0, &[], &[1]);
+    let mut sink = rti.join(1, &[0], &[]);
+    let start = source.start();
+    sink.start();
+    sink.send(&[ToRti::NextEventTag(Tag::at(start))]);
+    source.send(&[
+        message(1, Tag::at(start), b"last words"),
+        ToRti::NextEventTag(Tag::at(start + 10)),
+    ]);
+    drop(source);
+    sink.wait_for("TaggedMessage");
+    sink.wait_for("StopRequest");
+    let stop = Tag::at(start + 1);
+    sink.send(&[
+        ToRti::LatestTagConfirmed(Tag::at(start)),
+        ToRti::StopRequestReply(stop),
+    ]);
+    sink.wait_for("StopGranted");
+    sink.resign();
+    assert_eq!(rti.ended(), 1);
+}
+
+#[test]
+fn a_port_in_use_is_named() {
+    let other = TcpListener::bind("127.0.0.1:0").unwrap();
+    let port = other.local_addr().unwrap().port();
+    let options = Options {
+        port,
+        ..Options::new("test", 1)
+    };
+    let Err(error @ BindError::InUse { .. }) = Server::bind(&options, Status::default()) else {
+        panic!("the port is in use");
+    };
+    let expected = format!(
+        "port {port} on 127.0.0.1 is already in use; choose another with `-p`, or 0 for any"
+    );
+    assert_eq!(error.to_string(), expected);
+}
+
+#[test]
+fn status_lines_tell_the_story() {
+    let (reader, writer) = std::io::pipe().unwrap();
+    let status = Status::to_file(Some(std::os::fd::OwnedFd::from(writer).into()));
+    let options = Options::new("test", 1);
+    let server = Server::bind(&options, status).unwrap();
+    let address = SocketAddr::new(options.bind, server.port());
+    let rti = Running {
+        address,
+        thread: std::thread::spawn(move || server.run().unwrap()),
+    };
+    let mut only = rti.join(0, &[], &[]);
+    only.start();
+    only.resign();
+    assert_eq!(rti.ended(), 0);
+    let events: Vec<String> = BufReader::new(reader)
+        .lines()
+        .map(|line| {
+            let line: serde_json::Value = serde_json::from_str(&line.unwrap()).unwrap();
+            line["event"].as_str().unwrap().to_owned()
+        })
+        .collect();
+    assert_eq!(
+        events,
+        ["listening", "joined", "start", "resigned", "ended"]
+    );
+}
