@@ -13,7 +13,7 @@ use crate::wiring::Wire;
 /// no output of it depends on the input at the same tag, is legal.
 pub(crate) fn check(members: &[Member<'_>], wires: &[Wire], report: &mut Report) {
     let graph = Graph::new(members, wires);
-    let mut done: BTreeSet<usize> = BTreeSet::new();
+    let mut done: BTreeSet<usize> = graph.orderly();
     for wire in wires.iter().filter(|wire| wire.plan.after_ns.is_none()) {
         let (Some(&from), Some(&to)) = (graph.id(wire, true), graph.id(wire, false)) else {
             continue;
@@ -41,6 +41,7 @@ pub(crate) fn check(members: &[Member<'_>], wires: &[Wire], report: &mut Report)
 /// A port's channel: federate, name, channel.
 type PortChannel = (u16, String, u32);
 
+#[derive(Debug)]
 struct Graph {
     ids: BTreeMap<PortChannel, usize>,
     nodes: Vec<PortChannel>,
@@ -107,6 +108,28 @@ impl Graph {
         id
     }
 
+    /// The nodes that no loop leads to: those that a topological order can begin with.
+    fn orderly(&self) -> BTreeSet<usize> {
+        let mut waiting = vec![0_usize; self.nodes.len()];
+        for next in self.edges.iter().flatten() {
+            waiting[*next] += 1;
+        }
+        let mut ready: Vec<usize> = (0..waiting.len())
+            .filter(|node| waiting[*node] == 0)
+            .collect();
+        let mut orderly = BTreeSet::new();
+        while let Some(node) = ready.pop() {
+            orderly.insert(node);
+            for next in &self.edges[node] {
+                waiting[*next] -= 1;
+                if waiting[*next] == 0 {
+                    ready.push(*next);
+                }
+            }
+        }
+        orderly
+    }
+
     fn id(&self, wire: &Wire, from: bool) -> Option<&usize> {
         let end = if from { &wire.plan.from } else { &wire.plan.to };
         self.ids.get(&(end.federate, end.port.clone(), end.channel))
@@ -149,6 +172,116 @@ impl Graph {
             format!("{name}.{port}[{channel}]")
         } else {
             format!("{name}.{port}")
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::path::Path;
+
+    use ictus_coord::describe::{ClassDescription, PortDescription, TypeIdentity};
+    use ictus_coord::plan::{ConnectionPlan, Endpoint};
+    use proptest::prelude::*;
+
+    use super::*;
+    use crate::federation::Origin;
+    use crate::manifest::Federate;
+
+    fn port(name: &str) -> PortDescription {
+        PortDescription {
+            name: name.to_owned(),
+            width: None,
+            type_identity: TypeIdentity {
+                name: "f64".to_owned(),
+                fingerprint: String::new(),
+            },
+            serializers: vec!["native".to_owned()],
+        }
+    }
+
+    fn wire(from: usize, to: usize, after_ns: Option<i64>, entry: usize) -> Wire {
+        let end = |federate: usize, port: &str| Endpoint {
+            federate: u16::try_from(federate).unwrap(),
+            port: port.to_owned(),
+            channel: 0,
+        };
+        let (from, to) = (end(from, "out"), end(to, "input"));
+        let serializer = "native".to_owned();
+        Wire {
+            entry,
+            plan: ConnectionPlan {
+                from,
+                to,
+                after_ns,
+                serializer,
+                port_id: 0,
+            },
+        }
+    }
+
+    /// Whether any federate can reach itself without delay: over connections without `after`, through
+    /// federates that pass an input on at the same tag.
+    fn brute_force(passes: &[bool], edges: &[(usize, usize)]) -> bool {
+        let count = passes.len();
+        let mut reach = vec![vec![false; count]; count];
+        for &(from, to) in edges.iter().filter(|(_, to)| passes[*to]) {
+            reach[from][to] = true;
+        }
+        for via in 0..count {
+            for from in 0..count {
+                for to in 0..count {
+                    reach[from][to] |= reach[from][via] && reach[via][to];
+                }
+            }
+        }
+        (0..count).any(|node| reach[node][node])
+    }
+
+    proptest! {
+        /// A loop is reported exactly when some port depends on itself at the same tag.
+        #[test]
+        fn loops_are_found_and_only_they(
+            passes in prop::collection::vec(any::<bool>(), 1..6),
+            pairs in prop::collection::vec((0_usize..6, 0_usize..6, prop::option::of(0_i64..2)), 0..10),
+        ) {
+            let count = passes.len();
+            let names: Vec<String> = (0..count).map(|index| format!("f{index}")).collect();
+            let federate = Federate::default();
+            let members: Vec<Member<'_>> = names
+                .iter()
+                .zip(&passes)
+                .map(|(name, passes)| Member {
+                    name,
+                    federate: &federate,
+                    origin: Origin::Ours { program: None, class: None },
+                    description: Some(ClassDescription {
+                        inputs: vec![port("input")],
+                        outputs: vec![port("out")],
+                        zero_delay: passes
+                            .then(|| ("input".to_owned(), "out".to_owned()))
+                            .into_iter()
+                            .collect(),
+                        ..ClassDescription::default()
+                    }),
+                })
+                .collect();
+            let pairs: Vec<_> =
+                pairs.into_iter().map(|(from, to, after)| (from % count, to % count, after)).collect();
+            let wires: Vec<Wire> = pairs
+                .iter()
+                .enumerate()
+                .map(|(entry, (from, to, after))| wire(*from, *to, *after, entry))
+                .collect();
+            let immediate: Vec<(usize, usize)> = pairs
+                .iter()
+                .filter(|(_, _, after)| after.is_none())
+                .map(|(from, to, _)| (*from, *to))
+                .collect();
+            let mut report = Report::new(Path::new("x.yaml"), "");
+            check(&members, &wires, &mut report);
+            let (problems, _) = report.finish();
+            prop_assert_eq!(!problems.0.is_empty(), brute_force(&passes, &immediate), "{}", problems);
         }
     }
 }

@@ -12,7 +12,7 @@ use serde::{Deserialize, Serialize};
 pub use self::report::{
     ChainReport, ChainRun, OrderReport, OrderRun, PairReport, PairsReport, Summary, TimingReport,
 };
-use crate::trace::{TraceTag, files};
+use crate::trace::{TraceTag, complete_lines, files};
 
 /// What a run needs to settle: a steady figure leaves out this much logical time.
 const STEADY_NS: i64 = 5_000_000_000;
@@ -176,10 +176,7 @@ pub fn report_runs(
         end_to_end: spec
             .end_to_end
             .iter()
-            .map(|chain| ChainReport {
-                name: chain.name.clone(),
-                runs: by_run(chain),
-            })
+            .map(|chain| ChainReport::new(chain.name.clone(), by_run(chain)))
             .collect(),
     })
 }
@@ -216,7 +213,7 @@ impl Run {
         let mut run = Self::asked(spec);
         for path in files(dir, "timing").map_err(unreadable(dir))? {
             let text = std::fs::read_to_string(&path).map_err(unreadable(&path))?;
-            run.add(&text)
+            run.add(complete_lines(&text))
                 .map_err(|(line, what)| TimingError::Malformed { path, line, what })?;
         }
         run.sort();

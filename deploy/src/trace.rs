@@ -131,7 +131,7 @@ impl TraceSet {
                 .unwrap_or_default()
                 .to_string_lossy()
                 .into_owned();
-            set.add(&stem, &text)
+            set.add(&stem, complete_lines(&text))
                 .map_err(|(line, what)| TraceError::Malformed { path, line, what })?;
         }
         set.sort();
@@ -466,6 +466,11 @@ impl fmt::Display for Verdict {
     }
 }
 
+/// A text without the line that a killed writer left unfinished.
+pub(crate) fn complete_lines(text: &str) -> &str {
+    text.rfind('\n').map_or("", |end| &text[..=end])
+}
+
 /// The files of a folder with an extension, sorted.
 pub(crate) fn files(dir: &Path, extension: &str) -> std::io::Result<Vec<PathBuf>> {
     let mut files = Vec::new();
@@ -568,6 +573,12 @@ mod tests {
         );
         assert_eq!(set.add("a", "x"), Err((1, "no time")));
         assert_eq!(set.add("a", "0\t0\ta\t0\tmind\t-").map_err(|e| e.0), Err(1));
+    }
+
+    #[test]
+    fn an_unfinished_line_is_no_error() {
+        assert_eq!(complete_lines("a\nb\n1\t0"), "a\nb\n");
+        assert_eq!(complete_lines("1\t0"), "");
     }
 
     proptest! {

@@ -149,7 +149,7 @@ fn a_lost_sample_is_missing() {
         .lines()
         .filter(|line| !line.starts_with("110000000"))
         .collect();
-    fs::write(&path, kept.join("\n")).unwrap();
+    fs::write(&path, kept.join("\n") + "\n").unwrap();
     let run = report(dir.path(), &spec, &plan()).unwrap().end_to_end[0].runs[0];
     assert_eq!((run.ticks, run.missing, run.unfinished), (4, 1, 1));
     // Without the second hop's delay nothing changes: the first tag at which D runs is taken.

@@ -94,6 +94,26 @@ pub struct ChainReport {
     pub name: String,
     /// One per run.
     pub runs: Vec<ChainRun>,
+    /// The least and the largest median of the runs in milliseconds, steady where there is one; absent when no
+    /// chain ended.
+    pub medians_ms: Option<(f64, f64)>,
+}
+
+impl ChainReport {
+    pub(super) fn new(name: String, runs: Vec<ChainRun>) -> Self {
+        let medians = || {
+            runs.iter()
+                .filter_map(|run| run.steady.or(run.full))
+                .map(|s| s.p50_ms)
+        };
+        let least = medians().min_by(f64::total_cmp);
+        let medians_ms = least.zip(medians().max_by(f64::total_cmp));
+        Self {
+            name,
+            runs,
+            medians_ms,
+        }
+    }
 }
 
 /// Latency along a chain in one run.
@@ -263,6 +283,9 @@ impl fmt::Display for ChainReport {
                 f,
                 "\n  {name}{ticks} ticks, {missing} missing, {unfinished} cut by the end"
             )?;
+        }
+        if let (Some((least, most)), true) = (self.medians_ms, self.runs.len() > 1) {
+            write!(f, "\n  medians of the runs: {least:.3} to {most:.3} ms")?;
         }
         Ok(())
     }
