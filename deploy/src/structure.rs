@@ -216,7 +216,10 @@ impl<'a> Walker<'a> {
                 return Some(node.clone());
             }
             let message = format!("unknown value `{text}`");
-            let fix = suggest::fix(text, words.iter().copied());
+            let fix = match words {
+                [only] => format!("write `{only}`"),
+                several => suggest::fix(text, several.iter().copied()),
+            };
             self.report
                 .add("F005", Place::new(&self.path, Part::Value), message, fix);
             return None;

@@ -10,7 +10,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use ictus_deploy::{CheckOptions, Checked, FederateKind, Problems, check};
+use ictus_deploy::{CheckOptions, Checked, FederateKind, Problems, Progress, check};
 
 /// A folder with a manifest and `bin/NAME` for every name the fake program knows.
 struct Bench {
@@ -248,4 +248,94 @@ fn a_program_that_does_not_build_shows_its_first_error() {
     fs::write(bench.dir.path().join("broken/Cargo.toml"), "[package\n").unwrap();
     let shown = bench.shown(&options);
     assert!(shown.contains("cannot be built: error: "), "{shown}");
+}
+
+/// The two federations of the evaluation, as far as they can be read without their programs.
+#[test]
+fn the_shipped_manifests_have_the_form_of_their_papers() {
+    let compose = Path::new(env!("CARGO_MANIFEST_DIR")).join("../compose");
+    let read = |name: &str| {
+        let options = CheckOptions {
+            build: false,
+            ..CheckOptions::default()
+        };
+        let manifest = compose.join(name).join("federation.yaml");
+        check(&manifest, &options, &mut |_| {}).unwrap_or_else(|p| panic!("{p}"))
+    };
+    let diamond = read("diamond").plan;
+    assert_eq!((diamond.federates.len(), diamond.connections.len()), (4, 4));
+    assert!(
+        diamond
+            .connections
+            .iter()
+            .all(|wire| wire.after_ns == Some(5_000_000))
+    );
+    let autoware = read("autoware").plan;
+    assert_eq!(
+        (autoware.federates.len(), autoware.connections.len()),
+        (24, 29)
+    );
+    let class = |name: &str| {
+        autoware
+            .federates
+            .iter()
+            .filter(|one| one.class.as_deref() == Some(name))
+            .count()
+    };
+    let kinds = [
+        "Sensor",
+        "Transform",
+        "Fusion",
+        "Cyclic",
+        "Intersection",
+        "Command",
+    ];
+    assert_eq!(kinds.map(class), [6, 9, 5, 1, 1, 2]);
+}
+
+/// Foreign federates stand at the ids they were compiled with; ours fill the gaps in order.
+#[test]
+fn foreign_ids_come_first() {
+    let bench = Bench::new(
+        "ictus: v1\nfederation: f\nprograms: { fake: { binary: bin/fake } }\nfederates:\n  \
+         a: { class: Relay }\n  x: { binary: bin/camera, id: 0 }\n  b: { class: Relay }\n  \
+         y: { binary: bin/camera, id: 2, ports: { inputs: { i: { id: 7 } } } }\n\
+         connections:\n  - { from: a.out, to: [b.input, y.i] }\n",
+    );
+    let mut said = Vec::new();
+    let manifest = bench.dir.path().join("federation.yaml");
+    let checked = check(&manifest, &CheckOptions::default(), &mut |one| {
+        said.push(one)
+    });
+    let checked = checked.unwrap_or_else(|p| panic!("{p}"));
+    let names: Vec<&str> = checked
+        .federates
+        .iter()
+        .map(|run| run.name.as_str())
+        .collect();
+    assert_eq!(names, ["x", "a", "y", "b"]);
+    let ids: Vec<u16> = checked.federates.iter().map(|run| run.id).collect();
+    assert_eq!(ids, [0, 1, 2, 3]);
+    let ports: Vec<(u16, u16)> = checked
+        .plan
+        .connections
+        .iter()
+        .map(|wire| (wire.to.federate, wire.port_id))
+        .collect();
+    assert_eq!(ports, [(3, 0), (2, 7)]);
+    let executable = bench.dir.path().canonicalize().unwrap().join("bin/fake");
+    let program = "fake".to_owned();
+    assert_eq!(
+        said,
+        [
+            Progress::Built {
+                program: program.clone(),
+                executable
+            },
+            Progress::Described {
+                program,
+                federates: 2
+            }
+        ]
+    );
 }
