@@ -102,6 +102,8 @@ pub struct Agent {
     rti_port: Option<u16>,
     start_ns: Option<i64>,
     was_healthy: bool,
+    /// The RTI has lost a federate, so its own exit code is only a consequence.
+    lost_one: bool,
     failures: Vec<Ranked>,
     actions: VecDeque<Action>,
 }
@@ -223,6 +225,7 @@ impl Agent {
             rti_port: None,
             start_ns: None,
             was_healthy: false,
+            lost_one: false,
             failures: Vec::new(),
             actions: VecDeque::new(),
         }
@@ -472,6 +475,7 @@ impl Agent {
                 });
             }
             RtiStatus::Failed { federate, reason } => {
+                self.lost_one = true;
                 self.tell(Event::Lost {
                     federate: self.name(federate),
                     reason: reason.clone(),
@@ -542,7 +546,7 @@ impl Agent {
     fn handle_end(&mut self, now: Now, id: MemberId, record: &ExitRecord) {
         let starting = matches!(self.phase, Phase::Starting { .. });
         let start_agreed = self.start_ns.is_some();
-        let others_live = self.others_live(id);
+        let (others_live, lost_one) = (self.others_live(id), self.lost_one);
         let member = self.member_mut(id);
         member.process = Process::Ended;
         member.pid = record.pid;
@@ -554,7 +558,9 @@ impl Agent {
             start_agreed
         };
         let premature = match id {
-            MemberId::Rti => others_live,
+            // It returns 0 only when every federate has resigned, and may do so before they have ended.
+            MemberId::Rti if record.ending.success() => others_live && !start_agreed,
+            MemberId::Rti => others_live && !lost_one,
             MemberId::Federate(_) => starting && !ran,
         };
         let (name, reason) = (member.name.clone(), member.reason.clone());
@@ -584,7 +590,8 @@ impl Agent {
                 },
             );
         }
-        if matches!(self.phase, Phase::Running) && !self.federates.iter().any(Member::lives) {
+        let nothing_left = id == MemberId::Rti || !self.federates.iter().any(Member::lives);
+        if matches!(self.phase, Phase::Running) && nothing_left {
             self.expect_stop(now, Why::Program);
         }
     }

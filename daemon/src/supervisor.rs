@@ -107,7 +107,11 @@ enum Phase {
     /// The process lives.
     Running,
     /// It has ended; its pipes may still hold something.
-    Draining { ending: Ending, until: Instant },
+    Draining {
+        ending: Ending,
+        ended_ns: i64,
+        until: Instant,
+    },
     /// The record is written; somebody may want to read it.
     Lingering { until: Instant },
 }
@@ -184,15 +188,18 @@ impl Supervisor {
             }
             Err(why) => {
                 self.log.remark(&why);
-                self.drain_until_now(Ending::NotStarted { why });
+                self.drain(Ending::NotStarted { why }, Duration::ZERO);
             }
         }
     }
 
-    fn drain_until_now(&mut self, ending: Ending) {
+    /// The process has ended, now; its pipes are read for at most so long.
+    fn drain(&mut self, ending: Ending, at_most: Duration) {
+        let (ended_ns, until) = (stamp::now_ns(), Instant::now() + at_most);
         self.phase = Phase::Draining {
             ending,
-            until: Instant::now(),
+            ended_ns,
+            until,
         };
     }
 
@@ -216,15 +223,20 @@ impl Supervisor {
 
     /// Moves from phase to phase when it is time.
     fn step(&mut self) {
-        let Phase::Draining { ending, until } = &self.phase else {
+        let Phase::Draining {
+            ending,
+            ended_ns,
+            until,
+        } = &self.phase
+        else {
             return;
         };
         let drained = self.process.as_ref().is_none_or(|process| {
             process.out.is_none() && process.err.is_none() && process.status.is_none()
         });
         if drained || *until <= Instant::now() {
-            let ending = ending.clone();
-            self.finish(ending);
+            let (ending, ended_ns) = (ending.clone(), *ended_ns);
+            self.finish(ending, ended_ns);
         }
     }
 
@@ -324,11 +336,9 @@ impl Supervisor {
         let Some(process) = &mut self.process else {
             return;
         };
-        let ending = process.reap();
-        self.phase = Phase::Draining {
-            ending,
-            until: Instant::now() + DRAIN_MAX,
-        };
+        let ending = process.wait();
+        self.drain(ending, DRAIN_MAX);
+        process::kill_orphans();
     }
 
     fn read_pipe(&mut self, pipe: Pipe) {
@@ -372,7 +382,7 @@ impl Supervisor {
     }
 
     /// The process has ended and its pipes are empty: writes the record and tells it.
-    fn finish(&mut self, ending: Ending) {
+    fn finish(&mut self, ending: Ending, ended_ns: i64) {
         self.log.finish();
         let record = ExitRecord {
             protocol: PROTOCOL,
@@ -380,7 +390,7 @@ impl Supervisor {
             name: self.spec.name.clone(),
             pid: self.process.as_ref().map(Process::pid),
             started_ns: self.started_ns,
-            ended_ns: stamp::now_ns(),
+            ended_ns,
             ending,
             last_status: self.history.last.clone(),
             first_lines: self.log.first_lines().to_vec(),

@@ -325,6 +325,31 @@ fn the_programs_own_end_is_completed() {
 }
 
 #[test]
+fn an_rti_that_ends_before_its_federates_is_no_failure_when_all_have_resigned() {
+    let mut world = World::healthy();
+    world.ends(MemberId::Rti, OK);
+    assert_eq!(world.agent.state(), State::Stopping);
+    world.ends(A, OK);
+    world.ends(B, OK);
+    assert_eq!(world.agent.outcome(), Some(&Outcome::Completed));
+}
+
+#[test]
+fn an_rti_that_failed_because_of_a_federate_is_not_the_headline() {
+    let mut world = World::healthy();
+    world.rti(json!({"event": "failed", "federate": 0, "reason": "gone"}));
+    world.now = at(1);
+    world.ends(MemberId::Rti, Ending::Exited { code: 1 });
+    world.now = at(2);
+    world.ends(A, KILLED);
+    world.ends(B, Ending::Exited { code: 11 });
+    let Some(Outcome::Failed { failure, .. }) = world.agent.outcome() else {
+        panic!("{:?}", world.agent.outcome());
+    };
+    assert_eq!(failure.member.as_deref(), Some("a"));
+}
+
+#[test]
 fn a_lost_rti_ends_the_run_in_bounded_time() {
     let mut world = World::healthy();
     world.ends(MemberId::Rti, KILLED);

@@ -85,12 +85,9 @@ impl Process {
         }
     }
 
-    /// Takes the exit status after `pidfd` became readable, and ends what the process left behind:
-    /// its orphans are children of the supervisor, which is a subreaper.
-    pub(crate) fn reap(&mut self) -> Ending {
-        let ending = self.child.wait().map_or(Ending::Unknown, Ending::of);
-        kill_orphans();
-        ending
+    /// Takes the exit status after `pidfd` became readable.
+    pub(crate) fn wait(&mut self) -> Ending {
+        self.child.wait().map_or(Ending::Unknown, Ending::of)
     }
 }
 
@@ -129,9 +126,9 @@ pub(crate) fn own_executable() -> &'static Path {
     Path::new("/proc/self/exe")
 }
 
-/// Kills every child of this process until there is none; bounded, because a child that forks faster than it
-/// is killed must not hold the supervisor for ever.
-fn kill_orphans() {
+/// Ends what a process that has been waited for left behind: its orphans are children of the supervisor, which is a
+/// subreaper. Bounded: a child that forks faster than it is killed must not hold the supervisor for ever.
+pub(crate) fn kill_orphans() {
     for _ in 0..100 {
         match rustix::process::wait(WaitOptions::NOHANG) {
             Err(_) => return,

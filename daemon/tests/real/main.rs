@@ -1,0 +1,12 @@
+//! The daemon and its supervisors as real processes. Waits are on streams and pidfds, with a bound each.
+#![allow(
+    clippy::unwrap_used,
+    clippy::panic,
+    clippy::wildcard_enum_match_arm,
+    missing_docs,
+    reason = "tests"
+)]
+
+mod daemon;
+mod supervisor;
+mod world;
