@@ -137,7 +137,7 @@ pub(crate) struct Assembler<'a> {
     outside: Arc<Outside>,
     pub(crate) elaboration: Elaboration,
     /// By federate id: its top-level reactor, when it is built here.
-    pub(crate) reactors: Vec<Option<ReactorId>>,
+    reactors: Vec<Option<ReactorId>>,
     senders: Vec<Box<dyn crate::carrier::Sender>>,
     input_types: Vec<String>,
     inputs: Vec<usize>,
@@ -160,7 +160,11 @@ impl<'a> Assembler<'a> {
         }
     }
 
-    pub(crate) fn instantiate(&mut self, id: u16, classes: &[Class]) -> Result<(), AssemblyError> {
+    pub(crate) fn instantiate(
+        &mut self,
+        id: u16,
+        classes: &[Class],
+    ) -> Result<ReactorId, AssemblyError> {
         let no_federate = || AssemblyError::NoFederate { id };
         let federates = &self.plan.federates;
         let federate = federates.get(usize::from(id)).ok_or_else(no_federate)?;
@@ -182,7 +186,7 @@ impl<'a> Assembler<'a> {
             source,
         })?;
         self.reactors[usize::from(id)] = Some(reactor);
-        Ok(())
+        Ok(reactor)
     }
 
     fn connect(&mut self, index: usize) -> Result<(), AssemblyError> {
@@ -280,7 +284,7 @@ impl<'a> Assembler<'a> {
         format!("{}.{}", self.federate(endpoint).name, endpoint.port)
     }
 
-    fn finish(self) -> Result<Assembly, AssemblyError> {
+    pub(crate) fn finish(self) -> Result<Assembly, AssemblyError> {
         let Elaboration {
             program,
             mut bodies,

@@ -3,7 +3,7 @@
 use crate::access::Outcome;
 use crate::carrier::{Carrier, Sender};
 use crate::ctx::Ctx;
-pub use crate::observe::Observation;
+pub(crate) use crate::observe::Observation;
 use crate::observe::{Observer, Run};
 use crate::outside::{Outside, OutsideEvent};
 use crate::scope::BodyEntry;

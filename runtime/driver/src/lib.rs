@@ -11,7 +11,7 @@ mod carrier;
 mod class;
 mod clock;
 mod ctx;
-mod describe;
+pub mod describe;
 mod linker;
 mod observe;
 mod outside;

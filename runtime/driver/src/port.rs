@@ -44,6 +44,12 @@ impl<T: Value> Input<T> {
         self.port
     }
 
+    /// The input itself, for `#[of(ins[2])]`: one channel of a multiport.
+    #[must_use]
+    pub fn as_input(&self) -> Self {
+        Self::new(self.port)
+    }
+
     /// A child's input as the container's reactions write it.
     #[must_use]
     pub fn as_output(&self) -> Output<T> {
@@ -117,6 +123,12 @@ impl<T: Value> Output<T> {
     #[must_use]
     pub fn as_input(&self) -> Input<T> {
         Input::new(self.port)
+    }
+
+    /// The output itself, for `#[of(outs[2])]`: one channel of a multiport.
+    #[must_use]
+    pub fn as_output(&self) -> Self {
+        Self::new(self.port)
     }
 }
 

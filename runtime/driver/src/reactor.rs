@@ -15,7 +15,7 @@ pub trait Reactor: Sized + 'static {
     /// The name that manifests use.
     const NAME: &'static str;
     /// The values of all parameters.
-    type Parameters: From<Self::Given>;
+    type Parameters;
     /// Parameters as a container gives them to a child: `Default` gives none, methods of the parameters' names the rest.
     type Given;
     /// Ports, timers, actions and children.
