@@ -305,7 +305,7 @@ fn foreign_ids_come_first() {
     let mut said = Vec::new();
     let manifest = bench.dir.path().join("federation.yaml");
     let checked = check(&manifest, &CheckOptions::default(), &mut |one| {
-        said.push(one)
+        said.push(one);
     });
     let checked = checked.unwrap_or_else(|p| panic!("{p}"));
     let names: Vec<&str> = checked
