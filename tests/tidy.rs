@@ -140,7 +140,7 @@ fn every_module_file_is_used() {
         let stem = path.file_stem().unwrap().to_str().unwrap();
         let root_file = ["lib", "main", "build"].contains(&stem)
             || path.parent().is_some_and(|dir| dir.join("Cargo.toml").exists())
-            || path.parent().is_some_and(|dir| ["tests", "bin"].iter().any(|n| dir.ends_with(n)));
+            || path.parent().is_some_and(|dir| ["tests", "bin", "examples"].iter().any(|n| dir.ends_with(n)));
         let declared = texts.iter().any(|text| text.contains(&format!("mod {stem};")));
         assert!(root_file || declared, "{} is part of no crate", path.display());
     }
