@@ -42,12 +42,7 @@ struct Transform {
 #[reactions]
 impl Transform {
     #[reaction]
-    fn on_input(
-        &mut self,
-        ctx: &mut Ctx,
-        input: &Input<Message4kb>,
-        out: &mut Output<Message4kb>,
-    ) {
+    fn on_input(&mut self, ctx: &mut Ctx, input: &Input<Message4kb>, out: &mut Output<Message4kb>) {
         busy(self.work);
         if let Some(message) = input.get() {
             out.set(self.history.pass_on(message, ctx));
@@ -70,12 +65,7 @@ struct Fusion {
 #[reactions]
 impl Fusion {
     #[reaction]
-    fn on_first(
-        &mut self,
-        ctx: &mut Ctx,
-        first: &Input<Message4kb>,
-        out: &mut Output<Message4kb>,
-    ) {
+    fn on_first(&mut self, ctx: &mut Ctx, first: &Input<Message4kb>, out: &mut Output<Message4kb>) {
         self.keep(0, first, ctx, out);
     }
 

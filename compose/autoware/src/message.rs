@@ -37,7 +37,10 @@ impl Message4kb {
 
     /// Adds an entry, or replaces the node's own; a full message stays as it is.
     fn put(&mut self, entry: Entry) {
-        let own = self.used().iter().position(|e| e.node_name == entry.node_name);
+        let own = self
+            .used()
+            .iter()
+            .position(|e| e.node_name == entry.node_name);
         let place = own.unwrap_or(self.used().len());
         if let Some(free) = self.entries.get_mut(place) {
             *free = entry;

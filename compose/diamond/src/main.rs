@@ -151,7 +151,9 @@ mod tests {
     fn random_times_are_uniform_and_repeat() {
         let draw = || {
             let mut random = Random { state: 1 };
-            (0..1_000).map(|_| random.up_to(10.ms())).collect::<Vec<_>>()
+            (0..1_000)
+                .map(|_| random.up_to(10.ms()))
+                .collect::<Vec<_>>()
         };
         let times = draw();
         assert_eq!(times, draw());

@@ -75,6 +75,12 @@ pub enum Admission {
 #[derive(Debug)]
 pub struct Timeline {
     program: Arc<Program>,
+    state: State,
+}
+
+/// Everything that changes, apart from the program, so that both can be borrowed at once.
+#[derive(Debug)]
+struct State {
     queue: EventQueue,
     start: Tag,
     stop: Tag,
@@ -113,7 +119,7 @@ impl Timeline {
             })
             .collect();
         let nodes = program.nodes.len();
-        Self {
+        let state = State {
             ready: ReadyLists::new(&program),
             busy: BitSet::new(if program.relations.is_some() {
                 nodes
@@ -132,8 +138,8 @@ impl Timeline {
             unknown_count: 0,
             network_inputs_ran: false,
             overflow: false,
-            program,
-        }
+        };
+        Self { program, state }
     }
 
     /// The program.
@@ -144,9 +150,9 @@ impl Timeline {
 
     /// Queues startup and the first event of every timer.
     pub fn start(&mut self, start: Tag, stop: Tag) {
-        self.start = start;
-        self.stop = stop;
-        self.at = start.latest_earlier();
+        self.state.start = start;
+        self.state.stop = stop;
+        self.state.at = start.latest_earlier();
         for (index, kind) in self.program.actions.iter().enumerate() {
             let action = ActionId::new(index);
             let tag = match kind {
@@ -159,63 +165,67 @@ impl Timeline {
                 | ActionKind::Connection { .. }
                 | ActionKind::Network { .. } => continue,
             };
-            self.queue.push(tag, action, ValueId::NONE);
+            self.state.queue.push(tag, action, ValueId::NONE);
         }
     }
 
     /// The start tag; NEVER before [`Timeline::start`].
     #[must_use]
     pub fn start_tag(&self) -> Tag {
-        self.start
+        self.state.start
     }
 
     /// The tag at which shutdown reactions run; FOREVER when none is known.
     #[must_use]
     pub fn stop_tag(&self) -> Tag {
-        self.stop
+        self.state.stop
     }
 
     /// Makes the stop tag earlier (a stop was agreed); never later, and never at or before a completed tag.
     pub fn stop_at(&mut self, stop: Tag) {
-        let floor = self.at.successor();
-        self.stop = self.stop.min(stop.max(floor));
+        let floor = self.state.at.successor();
+        self.state.stop = self.state.stop.min(stop.max(floor));
     }
 
     /// The tag being executed, if one is.
     #[must_use]
     pub fn current(&self) -> Option<Tag> {
-        self.executing.then_some(self.at)
+        self.state.executing.then_some(self.state.at)
     }
 
     /// The tag being executed or else the last completed one; before the first, the tag before the start tag.
     #[must_use]
     pub fn at(&self) -> Tag {
-        self.at
+        self.state.at
     }
 
     /// Whether the stop tag is completed.
     #[must_use]
     pub fn finished(&self) -> bool {
-        !self.executing && self.at >= self.stop
+        !self.state.executing && self.state.at >= self.state.stop
     }
 
     /// Whether tag arithmetic has overflowed: the federation must stop.
     #[must_use]
     pub fn overflowed(&self) -> bool {
-        self.overflow
+        self.state.overflow
     }
 
     /// The earliest tag with something to do, bounded by the stop tag; FOREVER when there is none.
     #[inline]
     #[must_use]
     pub fn next_tag(&self) -> Tag {
-        self.queue.next_tag().unwrap_or(Tag::FOREVER).min(self.stop)
+        self.state
+            .queue
+            .next_tag()
+            .unwrap_or(Tag::FOREVER)
+            .min(self.state.stop)
     }
 
     /// The number of queued events.
     #[must_use]
     pub fn queued(&self) -> usize {
-        self.queue.len()
+        self.state.queue.len()
     }
 
     /// Begins to execute `tag`; `present` receives the actions that fire, for the executor to fetch their values.
@@ -223,18 +233,21 @@ impl Timeline {
     /// Inputs not known at `tag` block what is downstream of them until they are settled.
     #[inline]
     pub fn begin(&mut self, tag: Tag, present: &mut Vec<(ActionId, ValueId)>) {
-        debug_assert!(!self.executing && tag > self.at, "tags only grow");
-        self.at = tag;
-        self.executing = true;
-        self.network_inputs_ran = false;
-        let program = Arc::clone(&self.program);
-        self.refresh_unknown(&program);
-        while let Some((action, value)) = self.queue.pop_through(tag) {
-            self.fire(&program, action);
+        debug_assert!(
+            !self.state.executing && tag > self.state.at,
+            "tags only grow"
+        );
+        self.state.at = tag;
+        self.state.executing = true;
+        self.state.network_inputs_ran = false;
+        let Self { program, state } = self;
+        state.refresh_unknown(program);
+        while let Some((action, value)) = state.queue.pop_through(tag) {
+            state.fire(program, action);
             present.push((action, value));
         }
-        if tag == self.stop {
-            self.fire(&program, ActionId::SHUTDOWN);
+        if tag == state.stop {
+            state.fire(program, ActionId::SHUTDOWN);
             present.push((ActionId::SHUTDOWN, ValueId::NONE));
         }
     }
@@ -243,11 +256,203 @@ impl Timeline {
     ///
     /// For a federate whose upstream was lost: an ordinary tag past the lost one's last promise could be wrong.
     pub fn begin_shutdown_only(&mut self, present: &mut Vec<(ActionId, ValueId)>) {
-        self.queue = EventQueue::default();
+        self.state.queue = EventQueue::default();
         self.settle_all(Tag::FOREVER);
-        self.begin(self.stop, present);
+        self.begin(self.state.stop, present);
     }
 
+    /// Moves every node that may run now into `batch` and counts it as in flight.
+    ///
+    /// A node may run when no node before it in the graph can still run at this tag, and every network input of its
+    /// upstream cone is known. Without unknown inputs that is simply the lowest level.
+    #[inline]
+    pub fn ready(&mut self, batch: &mut Vec<NodeId>) -> Progress {
+        let simple = self.state.in_flight == 0 && self.state.unknown_count == 0;
+        if simple {
+            self.state.ready.take_lowest(batch);
+        } else if self.state.ready.is_empty() {
+            return if self.state.in_flight > 0 {
+                Progress::InFlight
+            } else {
+                self.state.rest()
+            };
+        } else {
+            self.take_independent(batch);
+        }
+        if batch.is_empty() {
+            return if self.state.in_flight > 0 {
+                Progress::InFlight
+            } else {
+                self.state.rest()
+            };
+        }
+        self.state.in_flight += u32::try_from(batch.len()).unwrap_or(u32::MAX);
+        Progress::Batch
+    }
+
+    fn take_independent(&mut self, batch: &mut Vec<NodeId>) {
+        let program = &self.program;
+        let Some(relations) = &program.relations else {
+            return;
+        };
+        let (busy, unknown) = (&self.state.busy, &self.state.unknown);
+        self.state.ready.take_if(batch, |node| {
+            !relations.ancestors[node.index()].intersects(busy)
+                && !relations.cone[node.index()].intersects(unknown)
+        });
+    }
+
+    /// Whether nothing that could still set the network output `output` at the current tag is left, and it was not set.
+    ///
+    /// Law `absent_is_final`: once true at a tag, the output's sender does not run at that tag.
+    #[must_use]
+    pub fn settled_without(&self, sender: NodeId) -> bool {
+        let Some(relations) = &self.program.relations else {
+            return false;
+        };
+        !self.state.busy.contains(sender.index())
+            && !relations.ancestors[sender.index()].intersects(&self.state.busy)
+            && !relations.cone[sender.index()].intersects(&self.state.unknown)
+    }
+
+    /// Takes what `batch` did: triggers what its outputs trigger, queues what it scheduled. Drains `effects` but for
+    /// `stop`, which the caller reads.
+    #[inline]
+    pub fn finish(&mut self, batch: &[NodeId], effects: &mut Effects) {
+        self.state.in_flight -= u32::try_from(batch.len()).unwrap_or(u32::MAX);
+        let Self { program, state } = self;
+        if program.relations.is_some() {
+            for node in batch {
+                state.busy.remove(node.index());
+            }
+        }
+        for slot in effects.set.drain(..) {
+            state.trigger(&program.slot_triggers[slot.index()], program);
+        }
+        for event in effects.scheduled.drain(..) {
+            state.schedule(program, event);
+        }
+    }
+
+    /// Queues an event from outside and returns its tag: the stamp plus the action's minimum delay, but after the
+    /// current tag, not before `floor` (what was promised to others), and spaced from the action's last event.
+    ///
+    /// # Panics
+    ///
+    /// When `action` is not a physical action.
+    pub fn schedule_physical(
+        &mut self,
+        stamp: PhysicalTime,
+        action: ActionId,
+        value: ValueId,
+        floor: Tag,
+    ) -> Tag {
+        let ActionKind::Physical {
+            min_delay,
+            min_spacing,
+        } = self.program.actions[action.index()]
+        else {
+            unreachable!("only physical actions are scheduled from outside")
+        };
+        let wanted = Tag::new(stamp.saturating_add(min_delay).as_logical(), 0);
+        let after_current = self.state.at.successor();
+        let last = self.state.latest[action.index()];
+        let spaced = match min_spacing {
+            Duration::ZERO => last.next_microstep().unwrap_or(Tag::NEVER),
+            _ if last == Tag::NEVER => Tag::NEVER,
+            _ => last.delayed(Delay::Time(min_spacing)),
+        };
+        let tag = wanted
+            .max(after_current)
+            .max(floor)
+            .max(spaced)
+            .max(self.state.start);
+        self.state.enqueue(tag, action, value)
+    }
+
+    /// Takes a message from another federate for `input` with the tag it carries.
+    ///
+    /// Over a delayed connection the n-th message for one tag goes n-1 microsteps later, in the order of the connection.
+    pub fn admit(&mut self, input: InputId, tag: Tag, value: ValueId) -> Admission {
+        let NetworkInput {
+            action, delayed, ..
+        } = self.program.inputs[input.index()];
+        let status = &mut self.state.inputs[input.index()];
+        let mut due = tag;
+        if delayed && due <= status.last {
+            due = status.last.next_microstep().unwrap_or(Tag::FOREVER);
+        }
+        status.last = status.last.max(due);
+        if due > self.state.at {
+            return Admission::Queued {
+                tag: self.state.enqueue(due, action, value),
+            };
+        }
+        if self.state.executing
+            && due == self.state.at
+            && self.state.unknown.contains(input.index())
+        {
+            let Self { program, state } = self;
+            state.fire(program, action);
+            return Admission::IntoCurrentTag;
+        }
+        let next = self.state.at.successor();
+        let actual = self.state.enqueue(next, action, value);
+        Admission::Tardy {
+            intended: tag,
+            actual,
+        }
+    }
+
+    /// Learns that the status of `input` is known up to and including `through`.
+    pub fn settle(&mut self, input: InputId, through: Tag) {
+        self.state.learn(input, through);
+    }
+
+    /// Learns that the status of every input is known up to and including `through`.
+    pub fn settle_all(&mut self, through: Tag) {
+        for status in &mut self.state.inputs {
+            status.known = status.known.max(through);
+        }
+        if self.state.executing && through >= self.state.at {
+            self.state.unknown.clear();
+            self.state.unknown_count = 0;
+        }
+    }
+
+    /// Drops what is blocked at the current tag: the status it waits for will never come.
+    pub fn abandon(&mut self) {
+        self.state.ready.clear();
+        self.state.busy.clear();
+        self.state.unknown.clear();
+        self.state.unknown_count = 0;
+    }
+
+    /// Ends the current tag and says whether a network input was present at it.
+    #[inline]
+    pub fn complete(&mut self) -> bool {
+        debug_assert!(
+            self.state.executing && self.state.in_flight == 0 && self.state.ready.is_empty(),
+            "tag done"
+        );
+        self.state.executing = false;
+        self.state.network_inputs_ran
+    }
+
+    /// The sender nodes, with their outputs.
+    pub fn senders(&self) -> impl Iterator<Item = (NodeId, OutputId)> + '_ {
+        self.program
+            .nodes
+            .iter()
+            .enumerate()
+            .filter_map(|(index, kind)| match kind {
+                NodeKind::Send { output } => Some((NodeId::new(index), *output)),
+                NodeKind::Reaction | NodeKind::Forward { .. } => None,
+            })
+    }
+}
+
+impl State {
     fn refresh_unknown(&mut self, program: &Program) {
         self.unknown_count = 0;
         if program.inputs.is_empty() {
@@ -295,87 +500,6 @@ impl Timeline {
         }
     }
 
-    /// Moves every node that may run now into `batch` and counts it as in flight.
-    ///
-    /// A node may run when no node before it in the graph can still run at this tag, and every network input of its
-    /// upstream cone is known. Without unknown inputs that is simply the lowest level.
-    #[inline]
-    pub fn ready(&mut self, batch: &mut Vec<NodeId>) -> Progress {
-        let simple = self.in_flight == 0 && self.unknown_count == 0;
-        if simple {
-            self.ready.take_lowest(batch);
-        } else if self.ready.is_empty() {
-            return if self.in_flight > 0 {
-                Progress::InFlight
-            } else {
-                self.rest()
-            };
-        } else {
-            self.take_independent(batch);
-        }
-        if batch.is_empty() {
-            return if self.in_flight > 0 {
-                Progress::InFlight
-            } else {
-                self.rest()
-            };
-        }
-        self.in_flight += u32::try_from(batch.len()).unwrap_or(u32::MAX);
-        Progress::Batch
-    }
-
-    fn rest(&self) -> Progress {
-        if self.ready.is_empty() && self.unknown_count == 0 {
-            Progress::TagDone
-        } else {
-            Progress::Blocked
-        }
-    }
-
-    fn take_independent(&mut self, batch: &mut Vec<NodeId>) {
-        let program = &self.program;
-        let Some(relations) = &program.relations else {
-            return;
-        };
-        let (busy, unknown) = (&self.busy, &self.unknown);
-        self.ready.take_if(batch, |node| {
-            !relations.ancestors[node.index()].intersects(busy)
-                && !relations.cone[node.index()].intersects(unknown)
-        });
-    }
-
-    /// Whether nothing that could still set the network output `output` at the current tag is left, and it was not set.
-    ///
-    /// Law `absent_is_final`: once true at a tag, the output's sender does not run at that tag.
-    #[must_use]
-    pub fn settled_without(&self, sender: NodeId) -> bool {
-        let Some(relations) = &self.program.relations else {
-            return false;
-        };
-        !self.busy.contains(sender.index())
-            && !relations.ancestors[sender.index()].intersects(&self.busy)
-            && !relations.cone[sender.index()].intersects(&self.unknown)
-    }
-
-    /// Takes what `batch` did: triggers what its outputs trigger, queues what it scheduled. Drains `effects` but for
-    /// `stop`, which the caller reads.
-    #[inline]
-    pub fn finish(&mut self, batch: &[NodeId], effects: &mut Effects) {
-        self.in_flight -= u32::try_from(batch.len()).unwrap_or(u32::MAX);
-        let program = Arc::clone(&self.program);
-        if program.relations.is_some() {
-            for node in batch {
-                self.busy.remove(node.index());
-            }
-        }
-        for slot in effects.set.drain(..) {
-            self.trigger(&program.slot_triggers[slot.index()], &program);
-        }
-        for event in effects.scheduled.drain(..) {
-            self.schedule(&program, event);
-        }
-    }
-
     #[inline]
     fn schedule(&mut self, program: &Program, event: Scheduled) {
         let delay = match program.actions[event.action.index()] {
@@ -416,89 +540,6 @@ impl Timeline {
         tag
     }
 
-    /// Queues an event from outside and returns its tag: the stamp plus the action's minimum delay, but after the
-    /// current tag, not before `floor` (what was promised to others), and spaced from the action's last event.
-    ///
-    /// # Panics
-    ///
-    /// When `action` is not a physical action.
-    pub fn schedule_physical(
-        &mut self,
-        stamp: PhysicalTime,
-        action: ActionId,
-        value: ValueId,
-        floor: Tag,
-    ) -> Tag {
-        let ActionKind::Physical {
-            min_delay,
-            min_spacing,
-        } = self.program.actions[action.index()]
-        else {
-            unreachable!("only physical actions are scheduled from outside")
-        };
-        let wanted = Tag::new(stamp.saturating_add(min_delay).as_logical(), 0);
-        let after_current = self.at.successor();
-        let last = self.latest[action.index()];
-        let spaced = match min_spacing {
-            Duration::ZERO => last.next_microstep().unwrap_or(Tag::NEVER),
-            _ if last == Tag::NEVER => Tag::NEVER,
-            _ => last.delayed(Delay::Time(min_spacing)),
-        };
-        let tag = wanted
-            .max(after_current)
-            .max(floor)
-            .max(spaced)
-            .max(self.start);
-        self.enqueue(tag, action, value)
-    }
-
-    /// Takes a message from another federate for `input` with the tag it carries.
-    ///
-    /// Over a delayed connection the n-th message for one tag goes n-1 microsteps later, in the order of the connection.
-    pub fn admit(&mut self, input: InputId, tag: Tag, value: ValueId) -> Admission {
-        let NetworkInput {
-            action, delayed, ..
-        } = self.program.inputs[input.index()];
-        let status = &mut self.inputs[input.index()];
-        let mut due = tag;
-        if delayed && due <= status.last {
-            due = status.last.next_microstep().unwrap_or(Tag::FOREVER);
-        }
-        status.last = status.last.max(due);
-        if due > self.at {
-            return Admission::Queued {
-                tag: self.enqueue(due, action, value),
-            };
-        }
-        if self.executing && due == self.at && self.unknown.contains(input.index()) {
-            let program = Arc::clone(&self.program);
-            self.fire(&program, action);
-            return Admission::IntoCurrentTag;
-        }
-        let next = self.at.successor();
-        let actual = self.enqueue(next, action, value);
-        Admission::Tardy {
-            intended: tag,
-            actual,
-        }
-    }
-
-    /// Learns that the status of `input` is known up to and including `through`.
-    pub fn settle(&mut self, input: InputId, through: Tag) {
-        self.learn(input, through);
-    }
-
-    /// Learns that the status of every input is known up to and including `through`.
-    pub fn settle_all(&mut self, through: Tag) {
-        for status in &mut self.inputs {
-            status.known = status.known.max(through);
-        }
-        if self.executing && through >= self.at {
-            self.unknown.clear();
-            self.unknown_count = 0;
-        }
-    }
-
     fn learn(&mut self, input: InputId, through: Tag) {
         let status = &mut self.inputs[input.index()];
         status.known = status.known.max(through);
@@ -508,35 +549,12 @@ impl Timeline {
         }
     }
 
-    /// Drops what is blocked at the current tag: the status it waits for will never come.
-    pub fn abandon(&mut self) {
-        self.ready.clear();
-        self.busy.clear();
-        self.unknown.clear();
-        self.unknown_count = 0;
-    }
-
-    /// Ends the current tag and says whether a network input was present at it.
-    #[inline]
-    pub fn complete(&mut self) -> bool {
-        debug_assert!(
-            self.executing && self.in_flight == 0 && self.ready.is_empty(),
-            "tag done"
-        );
-        self.executing = false;
-        self.network_inputs_ran
-    }
-
-    /// The sender nodes, with their outputs.
-    pub fn senders(&self) -> impl Iterator<Item = (NodeId, OutputId)> + '_ {
-        self.program
-            .nodes
-            .iter()
-            .enumerate()
-            .filter_map(|(index, kind)| match kind {
-                NodeKind::Send { output } => Some((NodeId::new(index), *output)),
-                NodeKind::Reaction | NodeKind::Forward { .. } => None,
-            })
+    fn rest(&self) -> Progress {
+        if self.ready.is_empty() && self.unknown_count == 0 {
+            Progress::TagDone
+        } else {
+            Progress::Blocked
+        }
     }
 }
 

@@ -157,9 +157,7 @@ impl<T: Value> Item for LogicalAction<T> {
         for event in self.scheduled.drain(..) {
             outcome.effects.scheduled.push(event);
             outcome.note(self.name, || {
-                let values = self.values.read();
-                let value = values.waiting.get(event.value);
-                T::DIGESTED.then(|| value.map(digest_of)).flatten()
+                digest_of(self.values.read().waiting.get(event.value)?)
             });
         }
     }

@@ -57,9 +57,8 @@ fn build<R: Reactions>(
     path: &str,
     parameters: Map<String, Value>,
 ) -> Result<ReactorId, ParameterError> {
-    let mut source = ParameterSource::new(parameters);
+    let mut source = ParameterSource::new(parameters, &R::parameters())?;
     let parameters = R::read(&mut source)?;
-    source.finish()?;
     Ok(elaboration.instance::<R>(path.to_owned(), 0, parameters).0)
 }
 

@@ -3,7 +3,6 @@
 use ictus_coord::describe::ParameterDescription;
 use serde::de::DeserializeOwned;
 use serde_json::{Map, Value};
-use std::collections::BTreeSet;
 use thiserror::Error;
 
 /// Why the parameters of an instance are not usable. Fatal for the instance.
@@ -50,14 +49,21 @@ fn known_list(known: &[String]) -> String {
 #[derive(Debug)]
 pub struct ParameterSource {
     given: Map<String, Value>,
-    known: BTreeSet<String>,
 }
 
 impl ParameterSource {
-    pub(crate) const fn new(given: Map<String, Value>) -> Self {
-        Self {
-            given,
-            known: BTreeSet::new(),
+    /// Refuses names that are no parameter, so that a misspelt one is not reported as missing.
+    pub(crate) fn new(
+        given: Map<String, Value>,
+        parameters: &[ParameterDescription],
+    ) -> Result<Self, ParameterError> {
+        let known = |name: &str| parameters.iter().any(|p| p.name == name);
+        match given.keys().find(|name| !known(name)) {
+            None => Ok(Self { given }),
+            Some(name) => Err(ParameterError::Unknown {
+                name: name.clone(),
+                known: parameters.iter().map(|p| p.name.clone()).collect(),
+            }),
         }
     }
 
@@ -71,7 +77,6 @@ impl ParameterSource {
         name: &str,
         type_name: &str,
     ) -> Result<Option<T>, ParameterError> {
-        self.known.insert(name.to_owned());
         let Some(value) = self.given.remove(name) else {
             return Ok(None);
         };
@@ -98,17 +103,6 @@ impl ParameterSource {
             name: name.to_owned(),
             type_name: type_name.to_owned(),
         })
-    }
-
-    /// Refuses values that nothing asked for.
-    pub(crate) fn finish(self) -> Result<(), ParameterError> {
-        match self.given.into_iter().next() {
-            None => Ok(()),
-            Some((name, _)) => Err(ParameterError::Unknown {
-                name,
-                known: self.known.into_iter().collect(),
-            }),
-        }
     }
 }
 

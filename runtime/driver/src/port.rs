@@ -153,11 +153,7 @@ impl<T: Value> Item for Output<T> {
         if self.set {
             self.set = false;
             outcome.effects.set.push(self.slot_id);
-            let digest = || {
-                let slot = self.slot.read();
-                T::DIGESTED.then(|| slot.last().map(digest_of)).flatten()
-            };
-            outcome.note(&self.name, digest);
+            outcome.note(&self.name, || digest_of(self.slot.read().last()?));
         }
     }
 }

@@ -10,7 +10,7 @@ mod digest;
 mod layout;
 mod native;
 
-pub use codec::{Codec, CodecError};
+pub use codec::{Codec, CodecError, Portable};
 pub use digest::Digest;
 pub use layout::Layout;
 pub use native::{Native, put_front, take_front};
@@ -27,16 +27,13 @@ use ictus_coord::describe::TypeIdentity;
     note = "add `#[derive(Clone, ictus::Value)]` to the type"
 )]
 pub trait Value: Clone + Send + 'static {
-    /// Whether [`Value::digest`] means anything; traces show `?` for a type that has no digest.
-    const DIGESTED: bool = true;
-
     /// The declared name, without module path.
     fn type_name() -> String;
 
     /// Describes field names, types and order.
     fn layout(layout: &mut Layout);
 
-    /// Mixes the value into a digest.
+    /// Mixes the value into a digest; a type that has none calls [`Digest::refuse`], and traces show `?`.
     fn digest(&self, digest: &mut Digest);
 
     /// Mixes several values into a digest, as calling [`Value::digest`] in order, or faster.
@@ -78,9 +75,9 @@ pub fn identity<T: Value>() -> TypeIdentity {
     }
 }
 
-/// The digest of one value.
+/// The digest of one value; `None` when its type has none.
 #[must_use]
-pub fn digest_of<T: Value>(value: &T) -> u64 {
+pub fn digest_of<T: Value>(value: &T) -> Option<u64> {
     let mut digest = Digest::new();
     value.digest(&mut digest);
     digest.finish()

@@ -75,31 +75,28 @@ impl Shape {
             }
         }
     }
-
-    fn types(&self) -> Vec<&Type> {
-        match self {
-            Self::Struct(fields) => fields.iter().map(|f| &f.ty).collect(),
-            Self::Enum(variants) => {
-                let fields = variants.iter().flat_map(|(_, fields)| fields);
-                fields.map(|f| &f.ty).collect()
-            }
-        }
-    }
 }
 
 fn bounded(generics: &Generics, bound: &TokenStream) -> Generics {
     let mut generics = generics.clone();
     for parameter in generics.type_params_mut() {
-        parameter.bounds.push(parse_quote!(#bound));
+        let bound: syn::TypeParam = parse_quote!(T: #bound);
+        parameter.bounds.extend(bound.bounds);
     }
     generics
 }
 
 fn value_impl(input: &DeriveInput, shape: &Shape, serializers: &Serializers) -> TokenStream {
     let name = &input.ident;
-    let generics = bounded(&input.generics, &quote!(::ictus::Value));
+    let mut bound = quote!(::ictus::Value);
+    if serializers.native.is_some() {
+        bound = quote!(#bound + ::ictus::value::Native);
+    }
+    if serializers.postcard {
+        bound = quote!(#bound + ::ictus::value::Portable);
+    }
+    let generics = bounded(&input.generics, &bound);
     let (impl_generics, type_generics, where_clause) = generics.split_for_impl();
-    let types = shape.types();
     let type_name = type_name(name, &input.generics);
     let (layout, digest) = match shape {
         Shape::Struct(fields) => (struct_layout(fields), struct_digest(fields)),
@@ -119,16 +116,10 @@ fn value_impl(input: &DeriveInput, shape: &Shape, serializers: &Serializers) -> 
             }
         }
     });
-    let digested = types.iter().map(|ty| {
-        // The type's tokens carry the user's span: a field that is no value is shown where it stands.
-        quote_spanned!(ty.span()=> && <#ty as ::ictus::Value>::DIGESTED)
-    });
     let name_text = name.to_string();
     quote! {
         #[automatically_derived]
         impl #impl_generics ::ictus::Value for #name #type_generics #where_clause {
-            const DIGESTED: bool = true #(#digested)*;
-
             fn type_name() -> ::std::string::String {
                 #type_name
             }
@@ -165,7 +156,8 @@ fn type_name(name: &Ident, generics: &Generics) -> TokenStream {
 fn field_layouts(fields: &[Field]) -> TokenStream {
     let parts = fields.iter().map(|field| {
         let (name, ty) = (field.name(), &field.ty);
-        quote! {
+        // The type's tokens carry the user's span: a field that is no value is shown where it stands.
+        quote_spanned! {ty.span()=>
             layout.field(#name);
             <#ty as ::ictus::Value>::layout(layout);
         }

@@ -144,8 +144,6 @@ impl Value for String {
 }
 
 impl<T: Value> Value for Vec<T> {
-    const DIGESTED: bool = T::DIGESTED;
-
     fn type_name() -> String {
         format!("Vec<{}>", T::type_name())
     }
@@ -191,8 +189,6 @@ impl<T: Value> Value for Vec<T> {
 }
 
 impl<T: Value> Value for Option<T> {
-    const DIGESTED: bool = T::DIGESTED;
-
     fn type_name() -> String {
         format!("Option<{}>", T::type_name())
     }
@@ -234,8 +230,6 @@ impl<T: Value> Value for Option<T> {
 }
 
 impl<T: Value> Value for Box<T> {
-    const DIGESTED: bool = T::DIGESTED;
-
     fn type_name() -> String {
         T::type_name()
     }
@@ -264,8 +258,6 @@ impl<T: Value> Value for Box<T> {
 }
 
 impl<T: Value, const N: usize> Value for [T; N] {
-    const DIGESTED: bool = T::DIGESTED;
-
     fn type_name() -> String {
         format!("[{}; {N}]", T::type_name())
     }
@@ -300,8 +292,6 @@ impl<T: Value, const N: usize> Value for [T; N] {
 macro_rules! tuples {
     ($(($($name:ident $index:tt),+))*) => {$(
         impl<$($name: Value),+> Value for ($($name,)+) {
-            const DIGESTED: bool = true $(&& $name::DIGESTED)+;
-
             fn type_name() -> String {
                 let names = [$($name::type_name()),+];
                 format!("({})", names.join(", "))

@@ -83,7 +83,17 @@ impl<T: Native> Codec<T> {
     }
 }
 
-impl<T: Serialize + DeserializeOwned> Codec<T> {
+/// What serde can write and read back: all that `#[value(postcard)]` asks.
+#[diagnostic::on_unimplemented(
+    message = "`{Self}` cannot be written by postcard",
+    label = "not serde's",
+    note = "add `#[derive(serde::Serialize, serde::Deserialize)]` to the type"
+)]
+pub trait Portable: Serialize + DeserializeOwned {}
+
+impl<T: Serialize + DeserializeOwned> Portable for T {}
+
+impl<T: Portable> Codec<T> {
     /// Postcard over serde.
     #[must_use]
     pub fn of_serde() -> Self {

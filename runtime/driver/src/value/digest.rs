@@ -7,6 +7,7 @@
 #[derive(Clone, Copy, Debug)]
 pub struct Digest {
     state: u64,
+    refused: bool,
 }
 
 const SEED: u64 = 0x9e37_79b9_7f4a_7c15;
@@ -16,7 +17,15 @@ impl Digest {
     /// The digest of nothing so far.
     #[must_use]
     pub const fn new() -> Self {
-        Self { state: SEED }
+        Self {
+            state: SEED,
+            refused: false,
+        }
+    }
+
+    /// Says that a part of the value has no digest, so that the whole has none.
+    pub const fn refuse(&mut self) {
+        self.refused = true;
     }
 
     /// Mixes one word in.
@@ -41,9 +50,17 @@ impl Digest {
         }
     }
 
-    /// The result.
+    /// The result; `None` when a part has no digest.
     #[must_use]
-    pub const fn finish(self) -> u64 {
+    pub const fn finish(self) -> Option<u64> {
+        if self.refused {
+            return None;
+        }
+        Some(self.mixed())
+    }
+
+    /// The state, mixed once more.
+    pub(crate) const fn mixed(self) -> u64 {
         let mut x = self.state;
         x = (x ^ (x >> 32)).wrapping_mul(FACTOR);
         x = (x ^ (x >> 29)).wrapping_mul(FACTOR);
@@ -66,6 +83,6 @@ mod tests {
         let mut digest = Digest::new();
         digest.word(1);
         digest.bytes(b"twelve bytes");
-        assert_eq!(format!("{:016x}", digest.finish()), "b4d951db7d2a909d");
+        assert_eq!(format!("{:016x}", digest.mixed()), "b4d951db7d2a909d");
     }
 }

@@ -56,6 +56,6 @@ impl Layout {
         let mut digest = Digest::new();
         digest.bytes(self.text.as_bytes());
         digest.word(self.text.len() as u64);
-        format!("{:016x}", digest.finish())
+        format!("{:016x}", digest.mixed())
     }
 }

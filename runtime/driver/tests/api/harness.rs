@@ -1,12 +1,12 @@
 //! Runs reactors in this process, as fast as they go, with a clock that the test moves.
 
-use ictus::{Assembly, AssemblyError, Class, Clock, Fault, Observation};
+use ictus::value::digest_of;
+use ictus::{Assembly, AssemblyError, Class, Clock, Fault, Observation, Value};
 use ictus_coord::plan::{
     ClockSync, ConnectionPlan, Coordination, Endpoint, FORMAT, FederatePlan, Plan,
 };
 use ictus_core::{
     Duration, Effects, Executor, LogicalTime, NodeId, PhysicalTime, Progress, Tag, Timeline,
-    ValueId,
 };
 use std::path::Path;
 use std::sync::Arc;
@@ -221,5 +221,35 @@ pub fn at(after_start: Duration, microstep: u32) -> Tag {
     Tag::new(LogicalTime::from_nanos(time.as_nanos()), microstep)
 }
 
-/// A value that stands for none, for tests of carriers.
-pub const NO_VALUE: ValueId = ValueId::NONE;
+/// One line of a trace: when, which reaction, what it did.
+pub fn line(when: (Duration, u32), reaction: (&str, u32), effects: &[(&str, u64)]) -> String {
+    record(when, reaction, "body", effects)
+}
+
+/// As [`line`] for a deadline handler.
+pub fn late(when: (Duration, u32), reaction: (&str, u32), effects: &[(&str, u64)]) -> String {
+    record(when, reaction, "deadline", effects)
+}
+
+fn record(
+    (time, microstep): (Duration, u32),
+    (path, index): (&str, u32),
+    kind: &str,
+    effects: &[(&str, u64)],
+) -> String {
+    let effects: Vec<_> = effects
+        .iter()
+        .map(|(name, d)| format!("{name}={d:016x}"))
+        .collect();
+    let effects = match effects.as_slice() {
+        [] => "-".to_owned(),
+        some => some.join(","),
+    };
+    let time = time.as_nanos();
+    format!("{time}\t{microstep}\t{path}\t{index}\t{kind}\t{effects}\n")
+}
+
+/// The digest of a value.
+pub fn d<T: Value>(value: T) -> u64 {
+    digest_of(&value).unwrap()
+}

@@ -8,5 +8,12 @@
     reason = "tests may fail loudly and are not documented item by item"
 )]
 
+mod assembling;
+mod deadlines;
+mod failures;
 mod harness;
-mod simple;
+mod hierarchy;
+mod physical;
+mod ports;
+mod time;
+mod values;
