@@ -230,6 +230,12 @@ impl Federate {
         self.outcome.as_ref()
     }
 
+    /// How it ended, taken out of the federate.
+    #[must_use]
+    pub fn into_outcome(self) -> Option<Outcome> {
+        self.outcome
+    }
+
     /// The next event, in order.
     #[must_use]
     pub fn poll_event(&mut self) -> Option<FederateEvent> {
@@ -330,7 +336,7 @@ impl Federate {
             self.timeline.begin(next, &mut self.present);
         }
         executor.begin(self.timeline.at());
-        let program = Arc::clone(self.timeline.program());
+        let program = self.timeline.program();
         for (action, value) in self.present.drain(..) {
             executor.arrive(action, program.action_slot(action), value);
         }
@@ -394,16 +400,46 @@ impl Federate {
         }
     }
 
-    /// Runs the batch node by node and takes what it did.
+    /// Runs the batch node by node and takes what it did; alone, where nobody waits for what was sent, the rest of
+    /// the tag with it.
     #[inline]
     pub fn run_batch(&mut self, executor: &mut impl FederateExecutor) {
-        let batch = std::mem::take(&mut self.batch);
+        let mut batch = std::mem::take(&mut self.batch);
         let tag = self.timeline.at();
-        for node in &batch {
-            self.run_node(*node, tag, executor);
+        if self.link.is_none() {
+            self.run_tag(tag, &mut batch, executor);
+        } else {
+            for node in &batch {
+                self.run_node(*node, tag, executor);
+            }
+            self.finish(&batch);
         }
-        self.finish(&batch);
         self.batch = batch;
+    }
+
+    #[inline]
+    fn run_tag(
+        &mut self,
+        tag: Tag,
+        batch: &mut Vec<NodeId>,
+        executor: &mut impl FederateExecutor,
+    ) {
+        loop {
+            self.counters.reactions += batch.len() as u64;
+            for node in batch.iter() {
+                executor.run(*node, tag, &mut self.effects);
+            }
+            self.timeline.finish(batch, &mut self.effects);
+            if std::mem::take(&mut self.effects.stop) {
+                self.request_stop_at_current();
+            }
+            batch.clear();
+            match self.timeline.ready(batch) {
+                Progress::Batch => {}
+                Progress::TagDone => return self.complete(),
+                Progress::InFlight | Progress::Blocked => return,
+            }
+        }
     }
 
     /// Runs one node of the batch; its effects are taken by the next [`Federate::finish`].
