@@ -110,9 +110,10 @@ pub fn instance(classes: &[Class], request: InstanceRequest) -> ClassDescription
         },
         Err(error) => {
             // The one who asks knows the federate and the class.
-            let text = match error {
-                AssemblyError::Parameter { source, .. } => source.to_string(),
-                other => other.to_string().replace(&format!("{name}."), ""),
+            let text = if let AssemblyError::Parameter { source, .. } = error {
+                source.to_string()
+            } else {
+                error.to_string().replace(&format!("{name}."), "")
             };
             ClassDescription {
                 class,

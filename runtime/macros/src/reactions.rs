@@ -1,7 +1,7 @@
 //! `#[reactions]`: signatures become declarations.
 
 use crate::options::{Options, take_attribute};
-use proc_macro2::{Span, TokenStream};
+use proc_macro2::TokenStream;
 use quote::{ToTokens, format_ident, quote, quote_spanned};
 use syn::spanned::Spanned;
 use syn::{
@@ -76,7 +76,7 @@ fn step(method: &mut ImplItemFn) -> Result<Option<TokenStream>> {
 
 /// An argument of a reaction.
 enum Argument {
-    Context { ty: Type },
+    Context { ty: Box<Type> },
     Item(Box<ItemArgument>),
 }
 
@@ -218,7 +218,7 @@ fn argument(typed: &mut PatType) -> Result<Argument> {
     let mutable = reference.mutability.is_some();
     let kind = type_name(&reference.elem);
     if kind == "Ctx" {
-        let ty = (*typed.ty).clone();
+        let ty = typed.ty.clone();
         return Ok(Argument::Context { ty });
     }
     check_kind(&kind, mutable, &typed.ty)?;
@@ -334,6 +334,5 @@ fn connections(method: &ImplItemFn, attribute: &Attribute) -> Result<TokenStream
         let message = "take `&mut Wiring`, which makes the connections";
         return Err(Error::new(name.span(), message));
     }
-    let _: Span = name.span();
     Ok(quote!(scope.connections(|wiring| Self::#name(#(#passed),*));))
 }
