@@ -1,1 +1,15 @@
-fn main() {}
+//! The `ictus` command: a skin over ictus-deploy and the daemon's API. By the names `ictusd` and `ictus-rti` it is
+//! the daemon and the RTI.
+
+use std::process::ExitCode;
+
+mod args;
+mod commands;
+mod error;
+mod runs;
+mod session;
+mod ui;
+
+fn main() -> ExitCode {
+    args::dispatch(std::env::args_os().collect())
+}

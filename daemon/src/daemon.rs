@@ -86,6 +86,17 @@ pub fn run(paths: &Paths) -> Result<Served, DaemonError> {
     served.map(|()| Served::Done)
 }
 
+/// Writes the daemon's own log to standard error, from `info` up or as `ICTUS_LOG` says.
+pub fn log_to_stderr() {
+    let filter = tracing_subscriber::EnvFilter::try_from_env("ICTUS_LOG")
+        .unwrap_or_else(|_| tracing_subscriber::EnvFilter::new("info"));
+    let subscriber = tracing_subscriber::fmt()
+        .with_env_filter(filter)
+        .with_ansi(false);
+    // Fails when there is a subscriber already, which then is the one to use.
+    subscriber.with_writer(io::stderr).try_init().ok();
+}
+
 async fn serve(paths: &Paths) -> Result<(), DaemonError> {
     // We hold the lock: a socket that is there is a dead daemon's.
     files::remove(&paths.socket()).map_err(system("remove a stale socket"))?;

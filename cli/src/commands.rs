@@ -1,0 +1,17 @@
+//! One file per command.
+
+pub(crate) mod bench;
+pub(crate) mod check;
+pub(crate) mod daemon;
+pub(crate) mod down;
+pub(crate) mod events;
+pub(crate) mod explain;
+pub(crate) mod init;
+pub(crate) mod logs;
+pub(crate) mod ps;
+pub(crate) mod schema;
+pub(crate) mod stop;
+pub(crate) mod supervise;
+pub(crate) mod timing;
+pub(crate) mod up;
+pub(crate) mod verify;

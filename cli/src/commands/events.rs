@@ -1,0 +1,120 @@
+//! `ictus events`: what happened to federations.
+
+use clap::Args;
+use ictusd::api::{Event, Happening, Outcome};
+use ictusd::stamp;
+
+use crate::error::CliError;
+use crate::session::Session;
+use crate::ui::{Ui, nanoseconds};
+
+/// Shows what happened to federations
+#[derive(Debug, Args)]
+pub(crate) struct Events {
+    /// Go on until Ctrl-C
+    #[arg(short, long)]
+    follow: bool,
+    /// Only of this federation
+    name: Option<String>,
+}
+
+impl Events {
+    pub(crate) fn run(&self, ui: &mut Ui) -> Result<(), CliError> {
+        let session = Session::new()?;
+        let name = self
+            .name
+            .as_deref()
+            .map(|name| session.name(Some(name)))
+            .transpose()?;
+        if !self.follow && session.known().is_empty() {
+            return Ok(());
+        }
+        session.block_on(async {
+            let client = session.daemon().await?;
+            let mut events = client.events(name.as_deref(), self.follow).await?;
+            while let Some(happening) = events.next().await? {
+                ui.result(&happening, || {
+                    let Happening {
+                        at_ns,
+                        federation,
+                        event,
+                    } = &happening;
+                    format!("{} {federation}: {}", stamp::text(*at_ns), describe(event))
+                })?;
+            }
+            Ok(())
+        })
+    }
+}
+
+/// An event in words.
+pub(crate) fn describe(event: &Event) -> String {
+    match event {
+        Event::Started { member, pid, .. } => format!("{member} was started (pid {pid})"),
+        Event::Listening { port } => format!("the RTI listens on 127.0.0.1:{port}"),
+        Event::Joined {
+            federate,
+            joined,
+            of,
+        } => format!("{federate} joined ({joined}/{of})"),
+        Event::StartTag { start_ns } => format!("the start tag is {}", stamp::text(*start_ns)),
+        Event::Running {
+            federate,
+            running,
+            of,
+        } => format!("{federate} runs ({running}/{of})"),
+        Event::Healthy => "healthy".to_owned(),
+        Event::Rejected { peer, reason } => format!("the RTI refused {peer}: {reason}"),
+        Event::StopRequested { by } => format!("{by} asked for a stop"),
+        Event::StopTag {
+            elapsed_ns,
+            microstep,
+        } => {
+            format!(
+                "the stop tag is {} after the start, microstep {microstep}",
+                nanoseconds(*elapsed_ns)
+            )
+        }
+        Event::Resigned { federate } => format!("{federate} resigned"),
+        Event::Lost { federate, reason } => format!("{federate} was lost: {reason}"),
+        Event::Exited {
+            member,
+            how,
+            reason: None,
+        } => format!("{member} ended: {how}"),
+        Event::Exited {
+            member,
+            how,
+            reason: Some(reason),
+        } => {
+            format!("{member} ended: {how} ({reason})")
+        }
+        Event::Signalled { signal, members } => {
+            format!(
+                "did not end in time and got {signal}: {}",
+                members.join(", ")
+            )
+        }
+        Event::Foreign { member, why } => format!("{member} is foreign and left alone: {why}"),
+        Event::Ended { outcome } => format!("ended: {}", describe_outcome(outcome)),
+    }
+}
+
+/// An outcome in words.
+pub(crate) fn describe_outcome(outcome: &Outcome) -> String {
+    match outcome {
+        Outcome::Completed => "completed".to_owned(),
+        Outcome::Stopped { missed } if missed.is_empty() => "stopped at the stop tag".to_owned(),
+        Outcome::Stopped { missed } => {
+            format!(
+                "stopped; did not reach the stop tag in time: {}",
+                missed.join(", ")
+            )
+        }
+        Outcome::Failed { failure, .. } => {
+            let who = failure.member.as_deref().unwrap_or("the federation");
+            format!("failed: {who}: {}", failure.what)
+        }
+        Outcome::Aborted => "undone before it was healthy".to_owned(),
+    }
+}

@@ -1,0 +1,125 @@
+//! How a command fails: what kind, why, and what to do about it.
+
+use std::error::Error;
+use std::fmt;
+
+use ictus_deploy::Problems;
+use ictusd::client::ClientError;
+use ictusd::paths::PathsError;
+
+/// The exit code of a wrong command line.
+pub(crate) const USAGE: u8 = 64;
+
+/// Why a command failed, for people.
+#[derive(Debug)]
+pub(crate) struct CliError {
+    pub(crate) kind: Kind,
+    source: Box<dyn Error + Send + Sync>,
+    pub(crate) hints: Vec<String>,
+}
+
+/// What kind of failure; decides the exit code.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Kind {
+    /// Something did not work.
+    Failed,
+    /// The manifest has mistakes.
+    Manifest,
+    /// It did not become healthy, or did not end, in time.
+    Timeout,
+    /// Who reads standard output went away.
+    BrokenPipe,
+}
+
+impl CliError {
+    pub(crate) fn new(kind: Kind, source: impl Into<Box<dyn Error + Send + Sync>>) -> Self {
+        Self {
+            kind,
+            source: source.into(),
+            hints: Vec::new(),
+        }
+    }
+
+    pub(crate) fn failed(source: impl Into<Box<dyn Error + Send + Sync>>) -> Self {
+        Self::new(Kind::Failed, source)
+    }
+
+    /// Adds a line on what to do.
+    pub(crate) fn hint(mut self, hint: impl Into<String>) -> Self {
+        self.hints.push(hint.into());
+        self
+    }
+
+    /// The process's exit code: table D6 of the deployment notes.
+    pub(crate) fn code(&self) -> u8 {
+        match self.kind {
+            Kind::Failed => 1,
+            Kind::Manifest => 3,
+            Kind::Timeout => 6,
+            Kind::BrokenPipe => 0,
+        }
+    }
+}
+
+impl fmt::Display for CliError {
+    /// The message with its sources, on one line unless a source has several.
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{}", self.source)?;
+        let mut source = self.source.source();
+        while let Some(error) = source {
+            write!(f, ": {error}")?;
+            source = error.source();
+        }
+        Ok(())
+    }
+}
+
+impl From<Problems> for CliError {
+    fn from(problems: Problems) -> Self {
+        Self::new(Kind::Manifest, problems)
+    }
+}
+
+impl From<PathsError> for CliError {
+    fn from(error: PathsError) -> Self {
+        let hint = match &error {
+            PathsError::TooLong { .. } => {
+                Some("set XDG_RUNTIME_DIR (or ICTUS_STATE_DIR) to a shorter directory")
+            }
+            PathsError::NoHome => Some("set HOME"),
+            PathsError::Relative { .. }
+            | PathsError::NotOurs { .. }
+            | PathsError::Unusable { .. } => None,
+        };
+        let failed = Self::failed(error);
+        match hint {
+            Some(hint) => failed.hint(hint),
+            None => failed,
+        }
+    }
+}
+
+impl From<ClientError> for CliError {
+    fn from(error: ClientError) -> Self {
+        if let ClientError::Paths(error) = error {
+            return error.into();
+        }
+        let known = error
+            .refusal()
+            .map(|refusal| refusal.known.join(", "))
+            .unwrap_or_default();
+        let log = if let ClientError::NotStarted { log, .. } = &error {
+            Some(log.clone())
+        } else {
+            None
+        };
+        let mut failed = Self::failed(error);
+        if !known.is_empty() {
+            failed = failed.hint(format!("known: {known}"));
+        }
+        if let Some(log) = log {
+            failed = failed.hint(format!("its log is {}", log.display()));
+        }
+        failed
+    }
+}

@@ -1,0 +1,159 @@
+//! Runs of a federation under names of their own, from start to the end of their timeout.
+
+use std::path::PathBuf;
+use std::process::Stdio;
+use std::time::Duration;
+
+use ictus_deploy::Checked;
+use ictusd::api::{Event, Happening, Outcome};
+use ictusd::client::Client;
+use ictusd::store::Directory;
+
+use crate::error::{CliError, Kind};
+use crate::session::{Session, request, succeed};
+use crate::ui::Ui;
+
+/// How much longer than its timeout a run may take: start, consensus, slow reactions.
+const SLACK: Duration = Duration::from_secs(60);
+
+/// Runs that are removed when this is.
+#[derive(Debug)]
+pub(crate) struct Runs<'a> {
+    session: &'a Session,
+    client: Client,
+    checked: &'a Checked,
+    limit: Duration,
+    names: Vec<String>,
+}
+
+impl<'a> Runs<'a> {
+    /// Prepares runs of a federation that ends by itself.
+    pub(crate) async fn new(session: &'a Session, checked: &'a Checked) -> Result<Self, CliError> {
+        let timeout = checked
+            .plan
+            .timeout_ns
+            .and_then(|ns| u64::try_from(ns).ok());
+        let Some(timeout) = timeout else {
+            let message = format!(
+                "{} has no timeout, so it never ends",
+                checked.manifest.display()
+            );
+            return Err(CliError::new(Kind::Manifest, message).hint("add a line `timeout: 10 s`"));
+        };
+        let limit = Duration::from_nanos(timeout).saturating_add(SLACK);
+        let client = session.daemon().await?;
+        Ok(Self {
+            session,
+            client,
+            checked,
+            limit,
+            names: Vec::new(),
+        })
+    }
+
+    /// Runs the federation once; gives the directory of what it left.
+    pub(crate) async fn federated(&mut self, trace: bool) -> Result<Directory, CliError> {
+        let own = &self.checked.plan.federation;
+        let name = format!("{own}.{}.{}", std::process::id(), self.names.len() + 1);
+        let mut stream = self
+            .client
+            .start(&name, &request(self.checked, trace))
+            .await?;
+        self.names.push(name.clone());
+        let outcome = async {
+            while let Some(Happening { event, .. }) = stream.next().await? {
+                if let Event::Ended { outcome } = event {
+                    return Ok(outcome);
+                }
+            }
+            Err(CliError::failed("the daemon went away"))
+        };
+        let outcome = self.bounded(outcome).await?;
+        succeed(&name, &outcome)?;
+        if outcome != Outcome::Completed {
+            return Err(CliError::failed(format!(
+                "run `{name}` was stopped from outside"
+            )));
+        }
+        Ok(Directory::of(&self.session.paths.federations(), &name))
+    }
+
+    /// Runs the whole plan in one process; gives the directory of its trace.
+    pub(crate) async fn in_one_process(&mut self) -> Result<PathBuf, CliError> {
+        let Some(program) = &self.checked.one_program else {
+            let message = "the federation cannot run in one process";
+            return Err(CliError::failed(message)
+                .hint("every federate must come from the same program, and none may be foreign"));
+        };
+        let name = format!(
+            "{}.{}.one",
+            self.checked.plan.federation,
+            std::process::id()
+        );
+        self.names.push(name.clone());
+        let directory = Directory::of(&self.session.paths.federations(), &name);
+        directory
+            .prepare(&request(self.checked, true))
+            .map_err(CliError::failed)?;
+        let log = directory.logs().join("one.log");
+        let out = std::fs::File::create(&log).map_err(CliError::failed)?;
+        let err = out.try_clone().map_err(CliError::failed)?;
+        let mut command = tokio::process::Command::new(program);
+        command
+            .arg("--plan")
+            .arg(directory.plan())
+            .arg("--trace")
+            .arg(directory.trace());
+        for run in &self.checked.federates {
+            command.envs(&run.env);
+        }
+        let cwd = self
+            .checked
+            .manifest
+            .parent()
+            .unwrap_or(std::path::Path::new("/"));
+        command
+            .current_dir(cwd)
+            .stdin(Stdio::null())
+            .stdout(out)
+            .stderr(err)
+            .kill_on_drop(true);
+        let mut child = command.spawn().map_err(CliError::failed)?;
+        let status = self
+            .bounded(async { child.wait().await.map_err(CliError::failed) })
+            .await?;
+        if status.success() {
+            return Ok(directory.trace());
+        }
+        let said = std::fs::read_to_string(&log).unwrap_or_default();
+        let mut message = format!("the run in one process failed: {status}");
+        for line in said.lines().take(20) {
+            message.push_str(&format!("\n  | {line}"));
+        }
+        Err(CliError::failed(message))
+    }
+
+    /// Removes what the runs left and lets the daemon end if it has nothing else to do.
+    pub(crate) async fn remove(self, ui: &mut Ui) {
+        for name in &self.names {
+            if let Err(error) = self.client.remove(name, true).await {
+                ui.warning(&format!("run `{name}` was not removed: {error}"));
+            }
+        }
+        // It ends by itself otherwise.
+        self.client.end().await.ok();
+    }
+
+    async fn bounded<T>(
+        &self,
+        work: impl Future<Output = Result<T, CliError>>,
+    ) -> Result<T, CliError> {
+        tokio::select! {
+            result = tokio::time::timeout(self.limit, work) => result.unwrap_or_else(|_| {
+                let seconds = self.limit.as_secs();
+                Err(CliError::new(Kind::Timeout, format!("a run did not end within {seconds} s")))
+            }),
+            _ = tokio::signal::ctrl_c() => Err(CliError::failed("interrupted")),
+        }
+    }
+}

@@ -1,0 +1,231 @@
+//! What commands share: the way to the daemon, the checked manifest, which federation is meant.
+
+use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
+
+use ictus_deploy::{CheckOptions, Checked, Progress, check};
+use ictusd::api::{Failure, FailureKind, FederationView, Outcome, StartRequest};
+use ictusd::client::Client;
+use ictusd::paths::Paths;
+use ictusd::store;
+use tokio::runtime::Runtime;
+
+use crate::args::ManifestArgs;
+use crate::error::{CliError, Kind};
+use crate::ui::Ui;
+
+/// A command's connection to this user's daemon.
+#[derive(Debug)]
+pub(crate) struct Session {
+    pub(crate) paths: Paths,
+    runtime: Runtime,
+}
+
+impl Session {
+    pub(crate) fn new() -> Result<Self, CliError> {
+        let runtime = tokio::runtime::Builder::new_current_thread()
+            .enable_all()
+            .build();
+        let runtime = runtime.map_err(CliError::failed)?;
+        Ok(Self {
+            paths: Paths::from_env()?,
+            runtime,
+        })
+    }
+
+    /// Runs a command's asynchronous part.
+    pub(crate) fn block_on<T>(&self, work: impl Future<Output = T>) -> T {
+        self.runtime.block_on(work)
+    }
+
+    /// The daemon, started if there is none.
+    pub(crate) async fn daemon(&self) -> Result<Client, CliError> {
+        let executable = std::env::current_exe().map_err(CliError::failed)?;
+        Ok(Client::find_or_start(&self.paths, &executable).await?)
+    }
+
+    /// Names of federations that run or have left something, sorted.
+    pub(crate) fn known(&self) -> Vec<String> {
+        store::names(&self.paths.federations())
+    }
+
+    /// The federation that is meant: by name, by manifest, or the only one there is.
+    pub(crate) fn name(&self, given: Option<&str>) -> Result<String, CliError> {
+        let known = self.known();
+        let Some(given) = given else {
+            return match known.as_slice() {
+                [only] => Ok(only.clone()),
+                [] => Err(CliError::failed("there is no federation").hint(UP)),
+                _ => Err(CliError::failed("there are several federations: say which")
+                    .hint(format!("known: {}", known.join(", ")))),
+            };
+        };
+        let is_path = given.contains('/') || given.ends_with(".yaml") || given.ends_with(".yml");
+        let name = if is_path || (!known.iter().any(|it| it == given) && Path::new(given).is_file())
+        {
+            name_in(Path::new(given))?
+        } else {
+            given.to_owned()
+        };
+        if known.contains(&name) {
+            return Ok(name);
+        }
+        let error = CliError::failed(format!("there is no federation `{name}`"));
+        Err(match known.as_slice() {
+            [] => error.hint(UP),
+            _ => error.hint(format!("known: {}", known.join(", "))),
+        })
+    }
+}
+
+const UP: &str = "`ictus up MANIFEST` starts one";
+
+/// The federation's name in a manifest.
+fn name_in(manifest: &Path) -> Result<String, CliError> {
+    let manifest = ManifestArgs {
+        manifest: manifest.to_path_buf(),
+        set: Vec::new(),
+    }
+    .path()?;
+    let options = CheckOptions {
+        build: false,
+        ..CheckOptions::default()
+    };
+    Ok(check(&manifest, &options, &mut |_| {})?.plan.federation)
+}
+
+/// Checks a manifest, building its programs, and says so stage by stage.
+pub(crate) fn checked(ui: &mut Ui, args: &ManifestArgs, build: bool) -> Result<Checked, CliError> {
+    let path = args.path()?;
+    let overrides = args.set.iter().cloned().collect();
+    let options = CheckOptions {
+        build,
+        overrides,
+        ..CheckOptions::default()
+    };
+    let start = Instant::now();
+    let checked = check(&path, &options, &mut |progress| match progress {
+        Progress::Building { program } => ui.progress("building", &program),
+        Progress::Compiled { program, package } => {
+            ui.progress("building", &format!("{program}: {package}"));
+        }
+        Progress::Built {
+            program,
+            executable,
+        } => {
+            let took = start.elapsed().as_secs_f64();
+            ui.stage(
+                "built",
+                &format!("{program} in {took:.1} s: {}", executable.display()),
+            );
+        }
+        Progress::Described { program, federates } => {
+            ui.progress("checking", &format!("{program}: {federates} federates"));
+        }
+    })?;
+    for warning in &checked.warnings {
+        ui.warning(&warning.to_string());
+    }
+    let (federates, connections) = (checked.plan.federates.len(), checked.plan.connections.len());
+    let what = count(federates, "federate");
+    let how = count(connections, "connection");
+    let without = if build {
+        ""
+    } else {
+        ", without running its programs"
+    };
+    ui.stage(
+        "checked",
+        &format!("{}: {what}, {how}{without}", path.display()),
+    );
+    Ok(checked)
+}
+
+/// What the daemon is asked to start.
+pub(crate) fn request(checked: &Checked, trace: bool) -> StartRequest {
+    let directory = checked
+        .manifest
+        .parent()
+        .map_or_else(PathBuf::new, Path::to_path_buf);
+    StartRequest {
+        manifest: checked.manifest.clone(),
+        cwd: directory,
+        plan: checked.plan.clone(),
+        federates: checked.federates.clone(),
+        settings: checked.settings.clone(),
+        timing: checked.timing.clone(),
+        trace,
+    }
+}
+
+/// An outcome as a command's result.
+pub(crate) fn succeed(name: &str, outcome: &Outcome) -> Result<(), CliError> {
+    match outcome {
+        Outcome::Completed | Outcome::Stopped { .. } => Ok(()),
+        Outcome::Aborted => Err(CliError::failed(format!(
+            "federation `{name}` was not started"
+        ))),
+        Outcome::Failed {
+            failure,
+            was_healthy,
+        } => Err(failed(name, failure, *was_healthy)),
+    }
+}
+
+/// The first cause, its own words, and where more of them are.
+fn failed(name: &str, failure: &Failure, was_healthy: bool) -> CliError {
+    let who = match failure.member.as_deref() {
+        Some("rti") => "the RTI".to_owned(),
+        Some(member) => format!("federate `{member}`"),
+        None => format!("federation `{name}`"),
+    };
+    let when = if was_healthy {
+        ""
+    } else {
+        "; everything was undone"
+    };
+    let mut message = format!("{who}: {}{when}", failure.what);
+    for line in &failure.lines {
+        message.push_str(&format!("\n  | {line}"));
+    }
+    let kind = match failure.kind {
+        FailureKind::Timeout => Kind::Timeout,
+        FailureKind::Process | FailureKind::Foreign => Kind::Failed,
+    };
+    let error = CliError::new(kind, message);
+    match &failure.log {
+        Some(log) => error.hint(format!("the whole log is {}", log.display())),
+        None => error.hint(format!("`ictus logs {name}` shows what the federates said")),
+    }
+}
+
+/// A future's result, or a time-out that says what was waited for.
+pub(crate) async fn within<T>(
+    limit: Duration,
+    what: &str,
+    work: impl Future<Output = Result<T, CliError>>,
+) -> Result<T, CliError> {
+    tokio::time::timeout(limit, work).await.unwrap_or_else(|_| {
+        let message = format!("{what} took longer than {} s", limit.as_secs_f64());
+        Err(CliError::new(Kind::Timeout, message).hint("`--timeout` gives it more time"))
+    })
+}
+
+/// `1 federate`, `2 federates`.
+pub(crate) fn count(number: usize, what: &str) -> String {
+    if number == 1 {
+        format!("1 {what}")
+    } else {
+        format!("{number} {what}s")
+    }
+}
+
+/// How long ago something was, as people read it.
+pub(crate) fn ago(view: &FederationView) -> String {
+    let seconds = ictusd::stamp::now_ns().saturating_sub(view.since_ns) / 1_000_000_000;
+    match seconds {
+        ..120 => format!("{seconds} s"),
+        120..7200 => format!("{} min", seconds / 60),
+        _ => format!("{} h", seconds / 3600),
+    }
+}
