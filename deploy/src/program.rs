@@ -186,10 +186,10 @@ impl Outcome {
                     self.executables
                         .push((package.clone(), PathBuf::from(executable)));
                 }
-                progress(Progress::Compiled {
-                    program: program.to_owned(),
-                    package,
-                });
+                if text("/target/kind/0") != Some("custom-build") {
+                    let program = program.to_owned();
+                    progress(Progress::Compiled { program, package });
+                }
             }
             _ => {}
         }

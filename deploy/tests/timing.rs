@@ -130,9 +130,9 @@ order at each tag: d.on_gamma before d.on_delta
   33.3 % of 3 tags, 1 the other way, 1 missing
 
 end to end: a to d
-                                  n     mean      std      p50      p99      max  ms
-  end to end                      3   14.000    0.000   14.000   14.000   14.000
-  timer floor                     4    0.065    0.013    0.060    0.080    0.080
+                                    n     mean      std      p50      p99      max  ms
+  end to end                        3   14.000    0.000   14.000   14.000   14.000
+  timer floor                       4    0.065    0.013    0.060    0.080    0.080
   4 ticks, 0 missing, 1 cut by the end"
     );
     let json = serde_json::to_value(&found).unwrap();

@@ -264,7 +264,7 @@ impl fmt::Display for ChainReport {
         let head = ["mean", "std", "p50", "p99", "max"]
             .map(|word| format!("{word:>9}"))
             .concat();
-        write!(f, "\n  {:26}{:>7}{head}  ms", "", "n")?;
+        write!(f, "\n  {:28}{:>7}{head}  ms", "", "n")?;
         for (number, run) in self.runs.iter().enumerate() {
             let name = run_name(self.runs.len(), number);
             row(f, &format!("{name}end to end"), run.full)?;
@@ -301,10 +301,10 @@ fn row(f: &mut fmt::Formatter<'_>, name: &str, summary: Option<Summary>) -> fmt:
         max_ms,
     }) = summary
     else {
-        return write!(f, "\n  {name:26}{:>7}", 0);
+        return write!(f, "\n  {name:28}{:>7}", 0);
     };
     let figures = [mean_ms, std_ms, p50_ms, p99_ms, max_ms].map(|figure| format!("{figure:9.3}"));
-    write!(f, "\n  {name:26}{count:7}{}", figures.concat())
+    write!(f, "\n  {name:28}{count:7}{}", figures.concat())
 }
 
 /// What stands before a run's line, when there are several.
