@@ -56,7 +56,7 @@ impl World {
                     edges.push((from.parse().unwrap(), to.parse().unwrap(), delay));
                 }
                 ["ours", ref ids @ ..] => {
-                    ours.extend(ids.iter().map(|id| id.parse::<u16>().unwrap()))
+                    ours.extend(ids.iter().map(|id| id.parse::<u16>().unwrap()));
                 }
                 ["option", "dnet", "off"] => config.dnet = false,
                 ["option", "clock", k] => config.clock_exchanges = k.parse().unwrap(),
@@ -111,7 +111,7 @@ impl World {
             }
             [name, "eof"] => {
                 self.rti
-                    .disconnect(self.now, self.connections[name], &Disconnect::Eof)
+                    .disconnect(self.now, self.connections[name], &Disconnect::Eof);
             }
             [name, "reset"] => {
                 self.rti

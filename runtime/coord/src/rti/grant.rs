@@ -2,7 +2,8 @@
 //!
 //! Source: reactor-c `rti_common.c`; section 6.3 of the wire document. Differences: a query changes nothing (there, a
 //! federate that never announced a tag has the start tag *stored* as announced), and the strict EIMT leaves out only
-//! members of the same zero-delay cycle (there, of any): what another cycle may still send is waited for.
+//! members of the same zero-delay cycle (there, of any): what another cycle may still send is waited for. When nothing can
+//! arrive any more, TAG(FOREVER) goes also to a federate that waits for nothing: there, an idle cycle hangs.
 
 use ictus_core::{Delay, Tag};
 
@@ -229,7 +230,7 @@ fn full_grant(view: &View<'_>, federate: FederateId) -> Option<Tag> {
     let not_strict = view.mutants.has(Mutant::EimtNotStrict) && earliest == next;
     let by_announcement = if next > Tag::NEVER && not_strict {
         Some(next)
-    } else if next > Tag::NEVER && earliest > next {
+    } else if next > Tag::NEVER && (earliest > next || earliest == Tag::FOREVER) {
         Some(before(view, earliest))
     } else {
         None
