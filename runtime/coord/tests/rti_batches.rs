@@ -23,6 +23,8 @@ const HOPS: u8 = 3;
 struct Program {
     edges: Vec<(u16, u16, Delay)>,
     periods: Vec<i64>,
+    /// Which federates skip the NETs that a DNET allows them to skip.
+    skips: Vec<bool>,
 }
 
 fn program() -> impl Strategy<Value = Program> {
@@ -32,8 +34,17 @@ fn program() -> impl Strategy<Value = Program> {
             let delay = if a < b { delay } else { delay.max(0) };
             (a, b, Delay::after(Duration::from_nanos(delay)))
         });
-        (vec(edge, 1..8), vec(0i64..7, usize::from(federates)))
-            .prop_map(|(edges, periods)| Program { edges, periods })
+        let federates = usize::from(federates);
+        (
+            vec(edge, 1..8),
+            vec(0i64..7, federates),
+            vec(any::<bool>(), federates),
+        )
+            .prop_map(|(edges, periods, skips)| Program {
+                edges,
+                periods,
+                skips,
+            })
     })
 }
 
@@ -59,6 +70,11 @@ struct Model {
     queue: BTreeMap<Tag, u8>,
     granted: Tag,
     announced: Option<Tag>,
+    /// DNET as the federate follows it; `None` until one has come, or when it ignores them.
+    dnet: Option<Tag>,
+    skips: bool,
+    last_net: Tag,
+    skipped: Option<Tag>,
     done: Tag,
     resigned: bool,
     out: Vec<u8>,
@@ -98,13 +114,35 @@ impl Model {
                     assert!(tag > self.granted, "grants rise");
                     self.granted = tag;
                 }
-                ToFederate::Ack
-                | ToFederate::Timestamp(_)
-                | ToFederate::DownstreamNextEventTag(_) => {}
+                ToFederate::DownstreamNextEventTag(tag) => self.follow(tag),
+                ToFederate::Ack | ToFederate::Timestamp(_) => {}
                 other => panic!("{other:?}"),
             }
         }
         assert_eq!(at, input.len(), "outputs hold whole messages");
+    }
+
+    fn follow(&mut self, dnet: Tag) {
+        if self.skips {
+            self.dnet = Some(dnet);
+            if let Some(skipped) = self.skipped.take_if(|skipped| dnet < *skipped) {
+                self.announce(skipped);
+            }
+        }
+    }
+
+    fn announce(&mut self, tag: Tag) {
+        self.last_net = tag;
+        self.skipped = None;
+        self.say(&ToRti::NextEventTag(tag));
+    }
+
+    /// Announces a tag that needs no grant: only for others' sake.
+    fn announce_for_others(&mut self, tag: Tag) {
+        match self.dnet {
+            Some(dnet) if tag <= dnet || dnet < self.last_net => self.skipped = Some(tag),
+            Some(_) | None => self.announce(tag),
+        }
     }
 
     fn act(&mut self) {
@@ -120,7 +158,7 @@ impl Model {
                 let announced = next.unwrap_or(Tag::FOREVER);
                 if self.announced != Some(announced) {
                     self.announced = Some(announced);
-                    self.say(&ToRti::NextEventTag(announced));
+                    self.announce(announced);
                 }
                 return;
             }
@@ -140,10 +178,12 @@ impl Model {
         self.trace.push((tag, hops));
         if hops < HOPS {
             for (federate, delay) in self.downstream.clone() {
+                let arrival = tag.delayed(delay);
+                self.dnet = self.dnet.map(|dnet| dnet.min(arrival));
                 let message = TaggedMessage {
                     port: 0,
                     federate,
-                    tag: tag.delayed(delay),
+                    tag: arrival,
                     payload: &[hops + 1],
                 };
                 self.say(&ToRti::TaggedMessage(message));
@@ -152,9 +192,9 @@ impl Model {
         self.done = tag;
         self.announced = None;
         self.say(&ToRti::LatestTagConfirmed(tag));
-        if !self.waits {
-            let next = self.queue.keys().next().copied().unwrap_or(Tag::FOREVER);
-            self.say(&ToRti::NextEventTag(next));
+        let next = self.queue.keys().next().copied().unwrap_or(Tag::FOREVER);
+        if !self.waits || next <= self.granted {
+            self.announce_for_others(next);
         }
     }
 }
@@ -204,6 +244,10 @@ fn begin(program: &Program) -> (Rti, Vec<Model>) {
             queue,
             granted: Tag::NEVER,
             announced: None,
+            dnet: None,
+            skips: program.skips[usize::from(federate)],
+            last_net: start,
+            skipped: None,
             done: Tag::NEVER,
             resigned: false,
             out: Vec::new(),
