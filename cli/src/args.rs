@@ -13,7 +13,10 @@ use crate::commands;
 use crate::error::{CliError, USAGE};
 use crate::ui::Ui;
 
-/// Runs federations of deterministic reactors from one manifest.
+const EXIT_CODES: &str =
+    "Exit codes: 0 done, 1 failed, 3 the manifest has mistakes, 6 not in time, 64 wrong usage";
+
+/// Run federations of deterministic reactors from one manifest
 #[derive(Debug, Parser)]
 #[command(
     name = "ictus",
@@ -21,7 +24,7 @@ use crate::ui::Ui;
     max_term_width = 100,
     subcommand_required = true
 )]
-#[command(arg_required_else_help = false, infer_subcommands = false)]
+#[command(after_help = EXIT_CODES)]
 pub(crate) struct Cli {
     #[command(flatten)]
     pub(crate) global: Global,
@@ -32,7 +35,7 @@ pub(crate) struct Cli {
 /// What every command takes.
 #[derive(Clone, Copy, Debug, Args)]
 pub(crate) struct Global {
-    /// How results are printed on standard output
+    /// How results are printed: for people, or for programs as one JSON value (for streams, one a line)
     #[arg(short, long, global = true, value_enum, default_value_t = Output::Table)]
     pub(crate) output: Output,
     /// Say only what went wrong
@@ -43,46 +46,32 @@ pub(crate) struct Global {
 /// How results are printed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub(crate) enum Output {
-    /// For people
     Table,
-    /// For programs: one JSON value, or one a line for streams
     Json,
 }
 
 #[derive(Debug, Subcommand)]
 enum Command {
-    /// Write a small federation to start from
     Init(commands::init::Init),
-    /// Find every mistake of a manifest before anything runs
     Check(commands::check::Check),
-    /// Start a federation; returns when it is healthy
     Up(commands::up::Up),
-    /// Show federations and their federates
     Ps(commands::ps::Ps),
-    /// Show what federates have written, merged by time
     Logs(commands::logs::Logs),
-    /// Show what happened to federations
     Events(commands::events::Events),
-    /// Show order and latency of a run, or of several new ones
     Timing(commands::timing::Timing),
-    /// Stop a federation at an agreed tag; `ps` and `logs` still know it
     Stop(commands::stop::Stop),
-    /// Stop a federation and remove all but its logs
     Down(commands::down::Down),
-    /// Compare the logical trace of one process with that of the federation
     Verify(commands::verify::Verify),
     /// Measure throughput and latency beside the floors of this machine
     Bench(PassedOn),
     /// Print the manifest's JSON Schema
     Schema,
-    /// Tell more about an error code
     Explain(commands::explain::Explain),
     /// Run an RTI with the options of Lingua Franca's
     #[command(disable_help_flag = true)]
     Rti(PassedOn),
     /// Serve the API; `up` starts it when it is needed
     Daemon,
-    /// Run one process of a spec and record its end
     #[command(hide = true)]
     Supervise(commands::supervise::Supervise),
 }

@@ -9,7 +9,7 @@ use crate::error::{CliError, Kind};
 use crate::session::checked;
 use crate::ui::Ui;
 
-/// Finds every mistake of a manifest before anything runs: file, line, column, and the fix
+/// Find every mistake of a manifest before anything runs: file, line, column, and the fix
 #[derive(Debug, Args)]
 pub(crate) struct Check {
     #[command(flatten)]

@@ -8,7 +8,7 @@ use crate::error::CliError;
 use crate::session::Session;
 use crate::ui::{Ui, nanoseconds};
 
-/// Shows what happened to federations
+/// Show what happened to federations
 #[derive(Debug, Args)]
 pub(crate) struct Events {
     /// Go on until Ctrl-C

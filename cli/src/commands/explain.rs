@@ -6,7 +6,7 @@ use serde_json::json;
 use crate::error::CliError;
 use crate::ui::Ui;
 
-/// Tells more about an error code
+/// Tell more about an error code
 #[derive(Debug, Args)]
 pub(crate) struct Explain {
     /// The code in brackets at the end of a message, such as F003

@@ -15,7 +15,7 @@ const DRIVER: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../runtime/driver");
 const MANIFEST: &str = include_str!("init/federation.yaml");
 const PROGRAM: &str = include_str!("init/main.rs.txt");
 
-/// Writes a small federation to start from: a manifest and a cargo package with two reactor classes
+/// Write a small federation to start from: a manifest and a cargo package with two reactor classes
 #[derive(Debug, Args)]
 pub(crate) struct Init {
     /// Where; made if it is not there

@@ -8,7 +8,7 @@ use crate::error::CliError;
 use crate::session::Session;
 use crate::ui::Ui;
 
-/// Shows what federates have written, merged by time
+/// Show what federates have written, merged by time
 #[derive(Debug, Args)]
 pub(crate) struct Logs {
     /// Go on until the federation ends

@@ -12,7 +12,7 @@ use crate::ui::{Table, Ui, nanoseconds};
 /// How often `--watch` looks.
 const PERIOD: Duration = Duration::from_secs(1);
 
-/// Shows federations and their federates
+/// Show federations and their federates
 #[derive(Debug, Args)]
 pub(crate) struct Ps {
     /// Show it again every second, until Ctrl-C

@@ -12,7 +12,7 @@ use crate::error::CliError;
 use crate::session::{Session, succeed, within};
 use crate::ui::Ui;
 
-/// Stops a federation at an agreed tag; `ps` and `logs` still know it
+/// Stop a federation at an agreed tag; `ps` and `logs` still know it
 #[derive(Debug, Args)]
 pub(crate) struct Stop {
     /// The federation: its name or manifest; may be left out when there is one

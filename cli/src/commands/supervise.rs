@@ -6,7 +6,7 @@ use clap::Args;
 
 use crate::error::CliError;
 
-/// Runs one process of a spec and records its end
+/// Run one process of a spec and records its end
 #[derive(Debug, Args)]
 pub(crate) struct Supervise {
     /// The spec, as the daemon writes it

@@ -15,7 +15,7 @@ use crate::runs::Runs;
 use crate::session::{Session, checked};
 use crate::ui::Ui;
 
-/// Shows order and latency of a run, or of several new ones
+/// Show order and latency of a run, or of several new ones
 ///
 /// Without `--runs`: of the last run of a federation, also while it runs. With `--runs N MANIFEST`: runs the federation
 /// N times to its timeout, one after the other, and compares them.

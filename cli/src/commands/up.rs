@@ -18,7 +18,7 @@ use crate::ui::Ui;
 /// How long undoing a start may take: the daemon's own bounds are shorter.
 const UNDO_MAX: Duration = Duration::from_secs(30);
 
-/// Starts a federation; returns when it is healthy
+/// Start a federation; returns when it is healthy
 ///
 /// Checks and builds, starts the RTI and every federate as a process of this machine, and reports each stage from what
 /// they say themselves. Ctrl-C before it is healthy undoes everything.

@@ -13,7 +13,7 @@ use crate::runs::Runs;
 use crate::session::{Session, checked};
 use crate::ui::{Table, Ui, nanoseconds};
 
-/// Compares the logical trace of one process with that of the federation
+/// Compare the logical trace of one process with that of the federation
 ///
 /// Runs the whole program in one process, then the federation with RTI and sockets several times, and compares what
 /// every reaction did at every tag. The manifest needs a `timeout`.
