@@ -7,12 +7,18 @@
 use std::collections::VecDeque;
 use std::time::Duration;
 
-use ictus_coord::report::{FederateStatus, RtiStatus, exit};
 use ictus_deploy::{FederateKind, Settings};
 
 use crate::api::{Event, Failure, FailureKind, MemberView, Outcome, StartRequest, State};
 use crate::supervisor::exit::{Ending, ExitRecord};
 use crate::supervisor::protocol::StopSignal;
+
+mod failure;
+mod member;
+mod status;
+mod stop;
+
+use member::{Member, Process};
 
 /// The RTI's name among the members.
 pub const RTI: &str = "rti";
@@ -106,36 +112,6 @@ pub struct Agent {
     lost_one: bool,
     failures: Vec<Ranked>,
     actions: VecDeque<Action>,
-}
-
-#[derive(Debug)]
-struct Member {
-    name: String,
-    ours: bool,
-    process: Process,
-    pid: Option<u32>,
-    joined: bool,
-    running: bool,
-    /// The last `progress` or `ended` status.
-    view: MemberView,
-    reason: Option<String>,
-    signalled: Option<StopSignal>,
-}
-
-/// Where a member's process stands.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Process {
-    /// Not asked for yet.
-    Waiting,
-    /// Its supervisor is being started or found.
-    Launching,
-    Up,
-    /// Ended; its supervisor is still there.
-    Ended,
-    /// Its supervisor is gone, too.
-    Gone,
-    /// Not ours; never touched.
-    Foreign,
 }
 
 #[derive(Debug)]
@@ -412,137 +388,6 @@ impl Agent {
         });
     }
 
-    fn handle_status(&mut self, now: Now, id: MemberId, line: &serde_json::Value) {
-        // A line of another version, or a foreign program's, tells nothing.
-        match id {
-            MemberId::Rti => {
-                if let Ok(status) = serde_json::from_value(line.clone()) {
-                    self.handle_rti_status(now, status);
-                }
-            }
-            MemberId::Federate(index) => {
-                if let Ok(status) = serde_json::from_value(line.clone()) {
-                    self.handle_federate_status(usize::from(index), status);
-                }
-            }
-        }
-    }
-
-    fn handle_rti_status(&mut self, now: Now, status: RtiStatus) {
-        match status {
-            RtiStatus::Listening { port } => self.handle_listening(port),
-            RtiStatus::Joined { federate } => {
-                if let Some(member) = self.federates.get_mut(usize::from(federate)) {
-                    member.joined = true;
-                }
-                let joined = self.federates.iter().filter(|member| member.joined).count();
-                let of = self.federates.len();
-                if let Phase::Starting { until } = &mut self.phase
-                    && joined == of
-                {
-                    *until = now.since + FIRST_TAG_MAX;
-                }
-                self.tell(Event::Joined {
-                    federate: self.name(federate),
-                    joined,
-                    of,
-                });
-            }
-            RtiStatus::Start { start_ns } => {
-                self.start_ns = Some(start_ns);
-                self.tell(Event::StartTag { start_ns });
-            }
-            RtiStatus::StopRequested { federate } => {
-                let by = federate.map_or_else(|| RTI.to_owned(), |id| self.name(id));
-                self.tell(Event::StopRequested { by });
-                if matches!(self.phase, Phase::Running) {
-                    self.expect_stop(now, Why::Program);
-                }
-            }
-            RtiStatus::Stop {
-                elapsed_ns,
-                microstep,
-            } => {
-                self.wait_for_stop_tag(now, elapsed_ns);
-                self.tell(Event::StopTag {
-                    elapsed_ns,
-                    microstep,
-                });
-            }
-            RtiStatus::Resigned { federate } => {
-                self.tell(Event::Resigned {
-                    federate: self.name(federate),
-                });
-            }
-            RtiStatus::Failed { federate, reason } => {
-                self.lost_one = true;
-                self.tell(Event::Lost {
-                    federate: self.name(federate),
-                    reason: reason.clone(),
-                });
-                let lost = self.federates.get(usize::from(federate));
-                if lost.is_some_and(|member| member.signalled.is_none()) {
-                    // The exit record says more, and ranks before this.
-                    let what = format!("was lost: {reason}");
-                    let failure = self.failure(now, MemberId::Federate(federate), what);
-                    self.fail(now, 1, failure);
-                }
-            }
-            RtiStatus::Rejected { peer, reason } => self.tell(Event::Rejected { peer, reason }),
-            RtiStatus::Ended { .. } => {}
-        }
-    }
-
-    fn handle_listening(&mut self, port: u16) {
-        self.rti_port = Some(port);
-        self.tell(Event::Listening { port });
-        if matches!(self.phase, Phase::Starting { .. }) {
-            for id in self.ids() {
-                self.launch(id);
-            }
-        }
-    }
-
-    fn handle_federate_status(&mut self, index: usize, status: FederateStatus) {
-        let Some(member) = self.federates.get_mut(index) else {
-            return;
-        };
-        match status {
-            // The RTI says these, for foreign federates as well.
-            FederateStatus::Joined { .. } | FederateStatus::Start { .. } => {}
-            FederateStatus::Running { .. } => {
-                member.running = true;
-                let federate = member.name.clone();
-                let ours = || self.federates.iter().filter(|member| member.ours);
-                let running = ours().filter(|member| member.running).count();
-                let of = ours().count();
-                self.tell(Event::Running {
-                    federate,
-                    running,
-                    of,
-                });
-            }
-            FederateStatus::Progress {
-                elapsed_ns,
-                tags,
-                reactions,
-                deadlines_missed,
-                ..
-            } => {
-                member.view.elapsed_ns = Some(elapsed_ns);
-                member.view.tags = Some(tags);
-                member.view.reactions = Some(reactions);
-                member.view.deadlines_missed = Some(deadlines_missed);
-            }
-            FederateStatus::Ended {
-                elapsed_ns, reason, ..
-            } => {
-                member.view.elapsed_ns = Some(elapsed_ns);
-                member.reason = Some(reason);
-            }
-        }
-    }
-
     fn handle_end(&mut self, now: Now, id: MemberId, record: &ExitRecord) {
         let starting = matches!(self.phase, Phase::Starting { .. });
         let start_agreed = self.start_ns.is_some();
@@ -596,33 +441,6 @@ impl Agent {
         }
     }
 
-    /// Whether an end is a failure, and how likely only a consequence of another; absent when it is none.
-    fn rank(&self, id: MemberId, ending: &Ending, premature: bool) -> Option<u8> {
-        let signalled = self.member(id).signalled;
-        match ending {
-            Ending::Exited { code: 0 } => (premature && signalled.is_none()).then_some(1),
-            Ending::Exited { code } => match u8::try_from(*code) {
-                Ok(exit::RTI_LOST | exit::PEER_FAILED) => self.unless_ladder(3),
-                Ok(exit::NOT_JOINED) => self.unless_ladder(2),
-                // It says that a federate failed.
-                _ if id == MemberId::Rti && !premature => self.unless_ladder(3),
-                _ => Some(0),
-            },
-            Ending::Killed { signal: 15 } if signalled.is_some() => None,
-            Ending::Killed { signal: 9 } if signalled == Some(StopSignal::Kill) => None,
-            Ending::Killed { .. } | Ending::NotStarted { .. } | Ending::Unknown => Some(0),
-        }
-    }
-
-    /// Once we signal federates ourselves, what others say about lost peers is our doing.
-    fn unless_ladder(&self, rank: u8) -> Option<u8> {
-        let ladder = self
-            .federates
-            .iter()
-            .any(|member| member.signalled.is_some());
-        (!ladder).then_some(rank)
-    }
-
     fn handle_closed(&mut self, now: Now, id: MemberId) {
         let member = self.member_mut(id);
         match member.process {
@@ -641,157 +459,6 @@ impl Agent {
             }
             Process::Ended => member.process = Process::Gone,
             Process::Waiting | Process::Gone | Process::Foreign => {}
-        }
-    }
-
-    /// Notes a failure and begins to end the rest.
-    fn fail(&mut self, now: Now, rank: u8, failure: Failure) {
-        self.failures.push(Ranked { rank, failure });
-        match self.phase {
-            Phase::Starting { .. } => self.undo(now, Why::Failure),
-            Phase::Running => self.expect_stop(now, Why::Failure),
-            Phase::Stopping { .. } | Phase::Ended(_) => {}
-        }
-    }
-
-    fn failure(&self, now: Now, id: MemberId, what: String) -> Failure {
-        Failure {
-            kind: FailureKind::Process,
-            member: Some(self.member(id).name.clone()),
-            what,
-            lines: Vec::new(),
-            log: None,
-            at_ns: now.wall_ns,
-        }
-    }
-
-    /// Asks the RTI for stop consensus.
-    fn begin_stop(&mut self, now: Now, why: Why) {
-        self.expect_stop(now, why);
-        self.signal(MemberId::Rti, StopSignal::Term);
-    }
-
-    /// The RTI or the federates are ending by themselves; bounds how long.
-    fn expect_stop(&mut self, now: Now, why: Why) {
-        let until = now.since + self.settings.stop_grace;
-        self.phase = Phase::Stopping {
-            why,
-            step: Step::Consensus,
-            until,
-            missed: Vec::new(),
-        };
-    }
-
-    /// The stop tag may lie in the future of physical time: the grace counts from it.
-    fn wait_for_stop_tag(&mut self, now: Now, elapsed_ns: i64) {
-        let grace = self.settings.stop_grace;
-        let stop_ns = self
-            .start_ns
-            .and_then(|start| start.checked_add(elapsed_ns));
-        let ahead_ns = stop_ns.map_or(0, |stop| stop.saturating_sub(now.wall_ns));
-        let ahead = Duration::from_nanos(u64::try_from(ahead_ns).unwrap_or(0));
-        if let Phase::Stopping {
-            step: Step::Consensus,
-            until,
-            ..
-        } = &mut self.phase
-        {
-            *until = now.since.saturating_add(ahead).saturating_add(grace);
-        }
-    }
-
-    /// Ends everything without consensus: nothing has run yet that could be finished.
-    fn undo(&mut self, now: Now, why: Why) {
-        let until = now.since + KILL_GRACE;
-        self.phase = Phase::Stopping {
-            why,
-            step: Step::Terminated,
-            until,
-            missed: Vec::new(),
-        };
-        for id in self.ids() {
-            self.signal(id, StopSignal::Term);
-        }
-    }
-
-    fn terminate(&mut self, now: Now) {
-        let late: Vec<_> = self
-            .federate_ids()
-            .filter(|id| self.member(*id).lives())
-            .collect();
-        let names: Vec<_> = late
-            .iter()
-            .map(|id| self.member(*id).name.clone())
-            .collect();
-        if let Phase::Stopping {
-            step,
-            until,
-            missed,
-            ..
-        } = &mut self.phase
-        {
-            *step = Step::Terminated;
-            *until = now.since + KILL_GRACE;
-            missed.clone_from(&names);
-        }
-        // Without federates it is the RTI that hangs.
-        let targets = if late.is_empty() {
-            vec![MemberId::Rti]
-        } else {
-            late
-        };
-        let names = if names.is_empty() {
-            vec![RTI.to_owned()]
-        } else {
-            names
-        };
-        self.tell(Event::Signalled {
-            signal: "SIGTERM".to_owned(),
-            members: names,
-        });
-        for id in targets {
-            self.signal(id, StopSignal::Term);
-        }
-    }
-
-    fn kill(&mut self, now: Now) {
-        let Phase::Stopping { step, until, .. } = &mut self.phase else {
-            return;
-        };
-        *step = Step::Killed;
-        *until = now.since + KILL_GRACE;
-        let late: Vec<_> = self
-            .ids()
-            .into_iter()
-            .filter(|id| self.member(*id).lives())
-            .collect();
-        if late.is_empty() {
-            return;
-        }
-        let members = late
-            .iter()
-            .map(|id| self.member(*id).name.clone())
-            .collect();
-        self.tell(Event::Signalled {
-            signal: "SIGKILL".to_owned(),
-            members,
-        });
-        for id in late {
-            self.signal(id, StopSignal::Kill);
-        }
-    }
-
-    /// Not even SIGKILL helped: a process in uninterruptible sleep, or a supervisor that hangs.
-    fn give_up(&mut self) {
-        for id in self.ids() {
-            let member = self.member_mut(id);
-            if member.process != Process::Waiting && member.process != Process::Foreign {
-                member
-                    .view
-                    .ending
-                    .get_or_insert_with(|| "did not end after SIGKILL".to_owned());
-                member.process = Process::Gone;
-            }
         }
     }
 
@@ -826,71 +493,12 @@ impl Agent {
         }
     }
 
-    fn conclude(&mut self) -> Outcome {
-        let first = self
-            .failures
-            .drain(..)
-            .min_by_key(|it| (it.rank, it.failure.at_ns));
-        match (first, &mut self.phase) {
-            (
-                _,
-                Phase::Stopping {
-                    why: Why::Aborted, ..
-                },
-            ) => Outcome::Aborted,
-            (Some(Ranked { failure, .. }), _) => Outcome::Failed {
-                failure,
-                was_healthy: self.was_healthy,
-            },
-            (
-                None,
-                Phase::Stopping {
-                    why: Why::Requested,
-                    missed,
-                    ..
-                },
-            ) => Outcome::Stopped {
-                missed: std::mem::take(missed),
-            },
-            (None, _) => Outcome::Completed,
-        }
-    }
-
-    /// Why the start takes too long.
-    fn late(&self) -> String {
-        let names = |late: &dyn Fn(&Member) -> bool| {
-            let late = self.federates.iter().filter(|member| late(member));
-            late.map(|member| member.name.as_str())
-                .collect::<Vec<_>>()
-                .join(", ")
-        };
-        let missing = names(&|member| !member.joined);
-        if self.rti_port.is_none() {
-            "the RTI does not listen".to_owned()
-        } else if !missing.is_empty() {
-            format!("not joined in time: {missing}")
-        } else if self.start_ns.is_none() {
-            "no start tag was agreed in time".to_owned()
-        } else {
-            let waiting = names(&|member| member.ours && !member.running);
-            format!("the first tag was not completed in time by: {waiting}")
-        }
-    }
-
     fn launch(&mut self, member: MemberId) {
         let rti_port = self.rti_port;
         let state = self.member_mut(member);
         if state.process == Process::Waiting {
             state.process = Process::Launching;
             self.actions.push_back(Action::Launch { member, rti_port });
-        }
-    }
-
-    fn signal(&mut self, member: MemberId, signal: StopSignal) {
-        let state = self.member_mut(member);
-        if state.lives() {
-            state.signalled = state.signalled.max(Some(signal));
-            self.actions.push_back(Action::Signal { member, signal });
         }
     }
 
@@ -932,46 +540,6 @@ impl Agent {
         match id {
             MemberId::Rti => &mut self.rti,
             MemberId::Federate(index) => &mut self.federates[usize::from(index)],
-        }
-    }
-}
-
-impl Member {
-    fn new(name: &str, ours: bool) -> Self {
-        Self {
-            name: name.to_owned(),
-            ours,
-            process: Process::Waiting,
-            pid: None,
-            joined: false,
-            running: false,
-            view: MemberView {
-                name: name.to_owned(),
-                ..MemberView::default()
-            },
-            reason: None,
-            signalled: None,
-        }
-    }
-
-    fn lives(&self) -> bool {
-        matches!(self.process, Process::Launching | Process::Up)
-    }
-
-    fn view(&self) -> MemberView {
-        let state = match self.process {
-            Process::Waiting => "waiting",
-            Process::Launching => "launching",
-            Process::Up if self.running => "running",
-            Process::Up if self.joined => "joined",
-            Process::Up => "up",
-            Process::Ended | Process::Gone => "ended",
-            Process::Foreign => "foreign",
-        };
-        MemberView {
-            state: state.to_owned(),
-            pid: self.pid,
-            ..self.view.clone()
         }
     }
 }

@@ -72,6 +72,8 @@ pub(crate) struct Federation {
     told: broadcast::Sender<Happening>,
     /// Events up to here were told by an earlier daemon.
     told_until_ns: i64,
+    /// When the last event was told.
+    told_last_ns: i64,
     /// When what is being handled happened.
     at_ns: i64,
     origin: Instant,
@@ -177,6 +179,7 @@ impl Federation {
             view,
             told,
             told_until_ns: 0,
+            told_last_ns: 0,
             at_ns: stamp::now_ns(),
             origin,
         };
@@ -304,15 +307,18 @@ impl Federation {
         } else {
             event
         };
-        let (federation, at_ns) = (self.record.view.name.clone(), self.at_ns);
+        let ended = matches!(event, Event::Ended { .. });
+        if self.at_ns <= self.told_until_ns && !ended {
+            return;
+        }
+        // Supervisors read at their own pace; what is told stays in order.
+        self.told_last_ns = self.told_last_ns.max(self.at_ns);
+        let federation = self.record.view.name.clone();
         let happening = Happening {
-            at_ns,
+            at_ns: self.told_last_ns,
             federation,
             event,
         };
-        if at_ns <= self.told_until_ns && !matches!(happening.event, Event::Ended { .. }) {
-            return;
-        }
         if let Err(error) = self.directory.append_event(&happening) {
             tracing::warn!(%error, "an event was not kept");
         }

@@ -10,7 +10,7 @@ use crate::error::CliError;
 use crate::session::{Session, within};
 use crate::ui::Ui;
 
-/// Stop a federation and removes all but its logs, which it names
+/// Stop a federation and remove all but its logs, which it names
 #[derive(Debug, Args)]
 pub(crate) struct Down {
     /// The federation: its name or manifest; may be left out when there is one

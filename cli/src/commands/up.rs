@@ -104,6 +104,7 @@ impl Up {
         plan: &Plan,
     ) -> Result<Start, CliError> {
         let mut stages = Stages {
+            all_started: false,
             joined: 0,
             of: plan.federates.len(),
         };
@@ -150,6 +151,7 @@ fn is_conflict(refusal: &ictusd::api::ApiError) -> bool {
 
 /// What has been reported.
 struct Stages {
+    all_started: bool,
     joined: usize,
     of: usize,
 }
@@ -158,7 +160,7 @@ impl Stages {
     fn report(&mut self, ui: &mut Ui, event: &Event) {
         match event {
             Event::Started { member, .. } if member == "rti" => {}
-            Event::Started { started, of, .. } => counted(ui, "started", *started, *of),
+            Event::Started { started, of, .. } => self.started(ui, *started, *of),
             Event::Listening { port } => {
                 ui.stage(
                     "started",
@@ -167,6 +169,9 @@ impl Stages {
             }
             Event::Joined { joined, of, .. } => {
                 self.joined = *joined;
+                if joined == of {
+                    self.started(ui, *of, *of);
+                }
                 counted(ui, "joined", *joined, *of);
             }
             Event::StartTag { start_ns } => ui.stage("agreed", &start_tag(*start_ns)),
@@ -181,9 +186,19 @@ impl Stages {
             | Event::Exited { .. }
             | Event::Signalled { .. }
             | Event::Foreign { .. } => {
-                let (said, Self { joined, of }) = (describe(event), self);
+                let (said, Self { joined, of, .. }) = (describe(event), self);
                 ui.stage("", &format!("{said} (joined {joined}/{of})"));
             }
+        }
+    }
+}
+
+impl Stages {
+    /// The RTI may hear from a federate before its supervisor is heard: started comes before joined all the same.
+    fn started(&mut self, ui: &mut Ui, started: usize, of: usize) {
+        if !self.all_started {
+            self.all_started = started == of;
+            counted(ui, "started", started, of);
         }
     }
 }

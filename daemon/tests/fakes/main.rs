@@ -5,6 +5,7 @@
     clippy::print_stdout,
     clippy::print_stderr,
     clippy::exit,
+    clippy::zombie_processes,
     reason = "a test program"
 )]
 

@@ -1,0 +1,75 @@
+//! A process of the federation, as far as the agent knows it.
+
+use crate::api::MemberView;
+use crate::supervisor::protocol::StopSignal;
+
+/// The RTI or a federate.
+#[derive(Debug)]
+pub(super) struct Member {
+    pub(super) name: String,
+    pub(super) ours: bool,
+    pub(super) process: Process,
+    pub(super) pid: Option<u32>,
+    pub(super) joined: bool,
+    pub(super) running: bool,
+    /// The last `progress` or `ended` status.
+    pub(super) view: MemberView,
+    pub(super) reason: Option<String>,
+    pub(super) signalled: Option<StopSignal>,
+}
+
+/// Where a member's process stands.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Process {
+    /// Not asked for yet.
+    Waiting,
+    /// Its supervisor is being started or found.
+    Launching,
+    Up,
+    /// Ended; its supervisor is still there.
+    Ended,
+    /// Its supervisor is gone, too.
+    Gone,
+    /// Not ours; never touched.
+    Foreign,
+}
+
+impl Member {
+    pub(super) fn new(name: &str, ours: bool) -> Self {
+        Self {
+            name: name.to_owned(),
+            ours,
+            process: Process::Waiting,
+            pid: None,
+            joined: false,
+            running: false,
+            view: MemberView {
+                name: name.to_owned(),
+                ..MemberView::default()
+            },
+            reason: None,
+            signalled: None,
+        }
+    }
+
+    pub(super) fn lives(&self) -> bool {
+        matches!(self.process, Process::Launching | Process::Up)
+    }
+
+    pub(super) fn view(&self) -> MemberView {
+        let state = match self.process {
+            Process::Waiting => "waiting",
+            Process::Launching => "launching",
+            Process::Up if self.running => "running",
+            Process::Up if self.joined => "joined",
+            Process::Up => "up",
+            Process::Ended | Process::Gone => "ended",
+            Process::Foreign => "foreign",
+        };
+        MemberView {
+            state: state.to_owned(),
+            pid: self.pid,
+            ..self.view.clone()
+        }
+    }
+}
