@@ -154,6 +154,9 @@ impl<T: Value> Item for LogicalAction<T> {
     #[inline]
     fn release(&mut self, _: Role, outcome: &mut Outcome<'_>) {
         self.held = None;
+        if self.scheduled.is_empty() {
+            return;
+        }
         for event in self.scheduled.drain(..) {
             outcome.effects.scheduled.push(event);
             outcome.note(self.name, || {

@@ -101,7 +101,6 @@ pub fn instance(classes: &[Class], request: InstanceRequest) -> ClassDescription
     let class = request.class.clone();
     let known = classes.iter().find(|c| c.name() == class);
     let parameters = known.map(Class::parameters).unwrap_or_default();
-    let name = request.name.clone();
     match build(classes, request) {
         Ok(description) => ClassDescription {
             class,
@@ -109,11 +108,11 @@ pub fn instance(classes: &[Class], request: InstanceRequest) -> ClassDescription
             ..description
         },
         Err(error) => {
-            // The one who asks knows the federate and the class.
+            // The one who asks knows the federate and the class of a parameter.
             let text = if let AssemblyError::Parameter { source, .. } = error {
                 source.to_string()
             } else {
-                error.to_string().replace(&format!("{name}."), "")
+                error.to_string()
             };
             ClassDescription {
                 class,

@@ -116,6 +116,20 @@ pub fn parameter(name: &str, type_name: &str, required: bool) -> ParameterDescri
     }
 }
 
+/// Parameters that are ready for an instance: all that have no default are given.
+#[diagnostic::on_unimplemented(
+    message = "a parameter without default is not given",
+    label = "a child's parameter is missing: `#[child(Class {{ parameter: value }})]`"
+)]
+pub trait Complete<P> {
+    /// The parameters, defaults filled in.
+    fn complete(self) -> P;
+}
+
+impl Complete<()> for () {
+    fn complete(self) {}
+}
+
 /// Stands for a required parameter that a child's literal does not give.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Missing;

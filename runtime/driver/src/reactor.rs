@@ -11,12 +11,67 @@ use std::ops::Deref;
 ///
 /// `Self` is what reactions reach as `self`: parameters and state. Ports, timers, actions and children are in
 /// [`Reactor::Parts`], out of the reach of `self`, so that a reaction touches only what its signature names.
+///
+/// By hand, without the macros:
+///
+/// ```
+/// use ictus::build::{
+///     ParameterDescription, ParameterError, ParameterSource, ReactionScope, Reactions, Reactor, Scope,
+///     effect, trigger,
+/// };
+/// use ictus::{Duration, DurationExt, Output, Timer};
+///
+/// struct Counter {
+///     count: u64,
+/// }
+///
+/// struct Parts {
+///     tick: Timer,
+///     out: Output<u64>,
+/// }
+///
+/// impl Reactor for Counter {
+///     const NAME: &'static str = "Counter";
+///     type Parameters = ();
+///     type Given = ();
+///     type Parts = Parts;
+///
+///     fn parameters() -> Vec<ParameterDescription> {
+///         Vec::new()
+///     }
+///
+///     fn read(_: &mut ParameterSource) -> Result<(), ParameterError> {
+///         Ok(())
+///     }
+///
+///     fn declare((): (), scope: &mut Scope<'_>) -> (Self, Parts) {
+///         let parts = Parts {
+///             tick: scope.timer(Duration::ZERO, 100.ms()),
+///             out: scope.output("out"),
+///         };
+///         (Self { count: 0 }, parts)
+///     }
+/// }
+///
+/// impl Reactions for Counter {
+///     fn react(&self, parts: &Parts, scope: &mut ReactionScope<'_, Self>) {
+///         let items = (trigger(&parts.tick), (effect(&parts.out), ()));
+///         scope.reaction("count", None, items, |state, _, (_, (out, ())), _| {
+///             state.count += 1;
+///             out.item_mut().set(state.count);
+///         });
+///     }
+/// }
+///
+/// ictus::program![Counter];
+/// ```
 pub trait Reactor: Sized + 'static {
     /// The name that manifests use.
     const NAME: &'static str;
     /// The values of all parameters.
     type Parameters;
-    /// Parameters as a container gives them to a child: `Default` gives none, methods of the parameters' names the rest.
+    /// Parameters as a container gives them to a child: `Default` gives none, methods of the parameters' names the
+    /// rest; [`Complete`](crate::build::Complete) once all that have no default are given.
     type Given;
     /// Ports, timers, actions and children.
     type Parts: 'static;

@@ -6,6 +6,7 @@ use crate::carrier::{Carrier, PortType, Typed};
 use crate::ctx::Ctx;
 use crate::linker::Linker;
 use crate::outside::Outside;
+use crate::parameters::Complete;
 use crate::port::{Input, Multi, Output};
 use crate::reactor::{Bank, Child, Reactions};
 use crate::slot::{Epoch, Shared, Signal};
@@ -221,15 +222,17 @@ impl Scope<'_> {
     pub fn child<R: Reactions>(
         &mut self,
         name: &str,
-        parameters: impl Into<R::Parameters>,
+        parameters: impl Complete<R::Parameters>,
     ) -> Child<R> {
         let path = format!("{}.{name}", self.path);
-        let instance = self.elaboration.instance::<R>(path, 0, parameters.into());
+        let instance = self
+            .elaboration
+            .instance::<R>(path, 0, parameters.complete());
         Child::new(instance.1)
     }
 
     /// Adds `width` nested reactors of one class; `parameters` gets the index of each.
-    pub fn bank<R: Reactions, P: Into<R::Parameters>>(
+    pub fn bank<R: Reactions, P: Complete<R::Parameters>>(
         &mut self,
         name: &str,
         width: usize,
@@ -237,7 +240,7 @@ impl Scope<'_> {
     ) -> Bank<R> {
         let members = (0..width).map(|index| {
             let path = format!("{}.{name}[{index}]", self.path);
-            let parameters = parameters(index).into();
+            let parameters = parameters(index).complete();
             let instance = self.elaboration.instance::<R>(path, index, parameters);
             Child::new(instance.1)
         });

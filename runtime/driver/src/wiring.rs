@@ -75,7 +75,12 @@ impl Wiring {
 
     pub(crate) fn apply(self, path: &str, elaboration: &mut Elaboration) {
         for link in self.links {
-            if !link.broadcast && link.from.len() != link.to.len() {
+            let fits = if link.broadcast {
+                link.to.is_empty() || !link.from.is_empty()
+            } else {
+                link.from.len() == link.to.len()
+            };
+            if !fits {
                 elaboration.errors.push(WiringError::Widths {
                     path: path.to_owned(),
                     from: link.from.len(),

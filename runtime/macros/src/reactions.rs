@@ -23,7 +23,7 @@ pub(crate) fn expand(attributes: TokenStream, item: TokenStream) -> Result<Token
             "write `#[reactions] impl Name { .. }`, without a trait",
         ));
     }
-    let mut steps = Vec::new();
+    let mut steps: Vec<TokenStream> = Vec::new();
     let mut errors: Option<Error> = None;
     for item in &mut block.items {
         let ImplItem::Fn(method) = item else {
@@ -37,8 +37,10 @@ pub(crate) fn expand(attributes: TokenStream, item: TokenStream) -> Result<Token
             },
         }
     }
+    // With a mistake, the block and an empty implementation stand in, so that no other error hides it.
     if let Some(errors) = errors {
-        return Err(errors);
+        let errors = errors.into_compile_error();
+        steps = vec![quote!(#errors)];
     }
     let (impl_generics, _, where_clause) = block.generics.split_for_impl();
     let this = &block.self_ty;
@@ -166,13 +168,17 @@ fn registration(
 }
 
 fn passed(i: usize, argument: &Argument) -> TokenStream {
-    let binding = format_ident!("item_{i}");
     match argument {
         Argument::Context { ty } => quote_spanned!(ty.span()=> ctx),
-        Argument::Item(item) if item.mutable => {
-            quote_spanned!(item.ty.span()=> #binding.item_mut())
+        Argument::Item(item) => {
+            let span = item.ty.span();
+            let binding = format_ident!("item_{i}", span = span);
+            if item.mutable {
+                quote_spanned!(span=> #binding.item_mut())
+            } else {
+                quote_spanned!(span=> #binding.item())
+            }
         }
-        Argument::Item(item) => quote_spanned!(item.ty.span()=> #binding.item()),
     }
 }
 

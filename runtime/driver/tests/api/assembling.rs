@@ -204,3 +204,25 @@ fn a_program_describes_its_classes() {
         [("gain", true), ("period", false), ("list", false)]
     );
 }
+
+#[reactor]
+struct Uneven {
+    #[width = 2]
+    ins: Multi<Input<u32>>,
+    #[width = 3]
+    outs: Multi<Output<u32>>,
+}
+
+#[reactions]
+impl Uneven {
+    #[connections]
+    fn wire(c: &mut Wiring, ins: &Multi<Input<u32>>, outs: &Multi<Output<u32>>) {
+        c.connect(ins, outs);
+    }
+}
+
+#[test]
+fn a_connection_of_different_widths_is_refused() {
+    let uneven = World::of(Class::of::<Uneven>());
+    assert_eq!(error(&uneven), "main: a connection joins 2 channels to 3");
+}

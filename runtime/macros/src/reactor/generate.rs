@@ -3,6 +3,7 @@
 use super::{Kind, Member, given};
 use proc_macro2::{Span, TokenStream, TokenTree};
 use quote::{ToTokens, format_ident, quote, quote_spanned};
+use syn::spanned::Spanned;
 use syn::{Expr, GenericParam, Generics, Ident, ItemStruct, Type, parse_quote};
 
 pub(super) fn all(input: &ItemStruct, members: &[Member]) -> TokenStream {
@@ -274,12 +275,13 @@ impl<'a> Class<'a> {
             }
         });
         quote! {
-            impl #impl_generics ::core::convert::From<#given #whole>
-                for #parameters #type_generics #where_clause
+            impl #impl_generics ::ictus::build::Complete<#parameters #type_generics>
+                for #given #whole #where_clause
             {
-                fn from(__given: #given #whole) -> Self {
+                fn complete(self) -> #parameters #type_generics {
+                    let __given = self;
                     #(#values)*
-                    Self { #(#names,)* __types: ::core::marker::PhantomData }
+                    #parameters { #(#names,)* __types: ::core::marker::PhantomData }
                 }
             }
         }
@@ -457,7 +459,7 @@ impl<'a> Class<'a> {
             }
             Kind::Child { class, given } => {
                 let given = self.with_parameters(&given::parameters(class, given.as_ref()));
-                quote!(__scope.child(#text, #given))
+                quote_spanned!(class.span()=> __scope.child(#text, #given))
             }
             Kind::Bank {
                 class,
@@ -472,7 +474,7 @@ impl<'a> Class<'a> {
                     }
                 };
                 let (given, width) = (self.with_parameters(&given), over(width));
-                quote!(__scope.bank(#text, #width, #given))
+                quote_spanned!(class.span()=> __scope.bank(#text, #width, #given))
             }
         };
         quote!(let #name: #ty = #value;)
