@@ -13,6 +13,7 @@ mod deadlines;
 mod failures;
 mod harness;
 mod hierarchy;
+mod observing;
 mod physical;
 mod ports;
 mod time;
