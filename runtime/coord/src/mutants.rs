@@ -51,6 +51,34 @@ pub enum Mutant {
     StopReplyTooEarly,
 }
 
+impl Mutant {
+    /// All of them.
+    pub const ALL: &[Self] = &[
+        Self::EimtNotStrict,
+        Self::InTransitIgnored,
+        Self::AfterZeroAsNone,
+        Self::StrictEimtDropped,
+        Self::LtcRuleDropped,
+        Self::FullInsteadOfProvisional,
+        Self::StopMaximumIgnored,
+        Self::ProvisionalFanOutDropped,
+        Self::ResignedKeepsNext,
+        Self::DownstreamNextTooLate,
+        Self::GrantBeforeMessage,
+        Self::GrantOneTooFar,
+        Self::LostAsResigned,
+        Self::LtcDelayNotStrict,
+        Self::ProvisionalAsFull,
+        Self::AbsentsByLevel,
+        Self::PhysicalPromiseDropped,
+        Self::SkippedNextForgotten,
+        Self::ConfirmedBeforeMessages,
+        Self::PromiseIgnored,
+        Self::AbsentsDropped,
+        Self::StopReplyTooEarly,
+    ];
+}
+
 /// The set of rules that are wrong; empty but in tests.
 #[derive(Clone, Copy, Default, PartialEq, Eq, Debug)]
 pub struct Mutants {

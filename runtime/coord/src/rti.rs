@@ -275,9 +275,10 @@ struct Member {
     sent_dnet: Tag,
     /// As far as it follows that DNET: it lowers it itself when it sends a message with an earlier tag.
     known_dnet: Tag,
-    last_downstream_confirmed: Tag,
-    /// Up to here nothing can happen there any more; never falls.
-    confirmed: Tag,
+    /// Up to here its downstreams have handled what it sent, as it was last found.
+    downstream_confirmed: Tag,
+    /// The largest tag of a message from it.
+    last_relayed: Tag,
 }
 
 /// How far a federate is.
@@ -543,8 +544,8 @@ impl Member {
             in_transit: VecDeque::new(),
             sent_dnet: Tag::NEVER,
             known_dnet: Tag::NEVER,
-            last_downstream_confirmed: Tag::NEVER,
-            confirmed: Tag::NEVER,
+            downstream_confirmed: Tag::NEVER,
+            last_relayed: Tag::NEVER,
         }
     }
 }

@@ -294,8 +294,8 @@ pub enum ToFederate<'a> {
     },
     /// The RTI gives up; the federate exits with an error.
     Failed,
-    /// The least tag that all federates reachable downstream have completed; it never falls, and is
-    /// [`Tag::FOREVER`] when none is left. A later one replaces an earlier one.
+    /// Every message for an immediate downstream with a tag up to this one is handled. Not monotone; a later one
+    /// replaces an earlier one.
     DownstreamConfirmed(Tag),
     /// A federate was lost without resigning; sent before the stop request that follows from it.
     FederateLost {

@@ -1,7 +1,13 @@
 //! Law `batches_do_not_matter`: small federations of model federates run against the RTI, with their bytes cut and drained
 //! in ways that a seed decides. What they do must not depend on it.
 
-#![allow(clippy::unwrap_used, clippy::panic, missing_docs, reason = "a test")]
+#![allow(
+    clippy::unwrap_used,
+    clippy::panic,
+    clippy::wildcard_enum_match_arm,
+    missing_docs,
+    reason = "a test"
+)]
 
 use std::collections::BTreeMap;
 

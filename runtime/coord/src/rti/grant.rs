@@ -3,7 +3,8 @@
 //! Source: reactor-c `rti_common.c`; section 6.3 of the wire document. Differences: a query changes nothing (there, a
 //! federate that never announced a tag has the start tag *stored* as announced), and the strict EIMT leaves out only
 //! members of the same zero-delay cycle (there, of any): what another cycle may still send is waited for. When nothing can
-//! arrive any more, TAG(FOREVER) goes also to a federate that waits for nothing: there, an idle cycle hangs.
+//! arrive any more, TAG(FOREVER) goes also to a federate that waits for nothing: there, an idle cycle hangs. What a PTAG
+//! demands of the other members of its cycle is sent as soon as it is safe, not only along with that PTAG.
 
 use ictus_core::{Delay, Tag};
 
@@ -218,6 +219,21 @@ pub fn tag_advance_grant(view: &View<'_>, federate: FederateId) -> Option<Grant>
         .map(Grant::Full)
         .filter(|&grant| standing.admits(grant))
         .or_else(|| provisional_grant(view, federate).filter(|&grant| standing.admits(grant)))
+        .or_else(|| demanded_grant(view, federate))
+}
+
+/// What the PTAGs under way demand of `federate` and was not possible when they were sent.
+fn demanded_grant(view: &View<'_>, federate: FederateId) -> Option<Grant> {
+    let downstream = view.topology.downstream(federate);
+    downstream.iter().find_map(|&(member, _)| {
+        let standing = &view.standings[member.index()];
+        let tag = standing.provisional;
+        let under_way = tag > standing.granted && tag > standing.completed;
+        let demanded = under_way && view.topology.share_zero_delay_cycle(member, federate);
+        demanded
+            .then(|| fan_out_grant(view, federate, tag))
+            .flatten()
+    })
 }
 
 /// The larger of what LTCs and what NETs allow, provided that it reaches the federate's own NET.

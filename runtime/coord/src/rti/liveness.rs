@@ -199,7 +199,6 @@ impl Rti {
         let member = &mut self.members[federate.index()];
         member.stage = Stage::Gone;
         member.in_transit.clear();
-        member.confirmed = Tag::FOREVER;
     }
 
     fn close_member(&mut self, federate: FederateId, closing: Closing) {

@@ -122,10 +122,7 @@ impl Rti {
         for &federate in &touched.affected.list {
             self.decide(federate, start);
         }
-        self.confirm_downstream(
-            start,
-            touched.affected.list.iter().chain(&touched.completed.list),
-        );
+        self.confirm_downstream();
         touched.affected.clear();
         if self.config.dnet {
             for &federate in &touched.next_event.list {

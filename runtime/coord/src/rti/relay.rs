@@ -37,8 +37,9 @@ impl Rti {
             Ok(Some((message, consumed))) => {
                 if usize::from(message.federate) < self.members.len() {
                     let to = FederateId::new(message.federate);
-                    let known_dnet = &mut self.members[from.index()].known_dnet;
-                    *known_dnet = message.tag.min(*known_dnet);
+                    let sender = &mut self.members[from.index()];
+                    sender.known_dnet = sender.known_dnet.min(message.tag);
+                    sender.last_relayed = sender.last_relayed.max(message.tag);
                     self.relay_message(to, message.tag, &bytes[..consumed]);
                 } else {
                     self.fail(from, format!("it sends to federate {}", message.federate));
