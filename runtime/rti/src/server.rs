@@ -8,6 +8,7 @@ use ictus_coord::rti::{ConnectionId, Disconnect, Rti, RtiEvent};
 use ictus_core::PhysicalTime;
 use mio::net::{TcpListener, UnixStream};
 use mio::{Events, Interest, Poll, Token};
+use rustix::net::sockopt;
 use signal_hook::consts::{SIGINT, SIGTERM};
 
 use crate::options::Options;
@@ -316,6 +317,15 @@ impl Server {
         }
         self.status.flush();
     }
+}
+
+/// Lets the system find out that a peer's host is gone: within half a minute of silence.
+fn keep_alive(stream: &mio::net::TcpStream) -> io::Result<()> {
+    sockopt::set_socket_keepalive(stream, true)?;
+    sockopt::set_tcp_keepidle(stream, Duration::from_secs(15))?;
+    sockopt::set_tcp_keepintvl(stream, Duration::from_secs(5))?;
+    sockopt::set_tcp_keepcnt(stream, 3)?;
+    Ok(())
 }
 
 /// Whether an error concerns one connection, or none.

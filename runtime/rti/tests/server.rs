@@ -4,6 +4,7 @@
 
 use std::io::{BufRead, BufReader, Read, Write};
 use std::net::{Shutdown, SocketAddr, TcpListener, TcpStream};
+use std::os::fd::AsRawFd;
 use std::thread::JoinHandle;
 use std::time::Duration;
 
@@ -85,7 +86,7 @@ impl Peer {
     fn next(&mut self) -> Option<String> {
         loop {
             if let Some((message, length)) = ToFederate::decode(&self.unread).unwrap() {
-                let told = format!("{message:?}");
+                let told = tell(&message);
                 self.unread.drain(..length);
                 return Some(told);
             }
@@ -127,6 +128,17 @@ impl Peer {
         self.send(&[ToRti::NextEventTag(Tag::FOREVER), ToRti::Resign]);
         self.stream.shutdown(Shutdown::Write).unwrap();
         while self.next().is_some() {}
+    }
+}
+
+fn tell(message: &ToFederate<'_>) -> String {
+    if let ToFederate::TaggedMessage(message) = message {
+        format!(
+            "TaggedMessage({})",
+            String::from_utf8_lossy(message.payload)
+        )
+    } else {
+        format!("{message:?}")
     }
 }
 
@@ -330,7 +342,9 @@ fn a_port_in_use_is_named() {
 #[test]
 fn status_lines_tell_the_story() {
     let (reader, writer) = std::io::pipe().unwrap();
-    let status = Status::to_file(Some(std::os::fd::OwnedFd::from(writer).into()));
+    let descriptor = u32::try_from(writer.as_raw_fd()).unwrap();
+    let status = Status::open(Some(descriptor)).unwrap();
+    drop(writer);
     let options = Options::new("test", 1);
     let server = Server::bind(&options, status).unwrap();
     let address = SocketAddr::new(options.bind, server.port());
