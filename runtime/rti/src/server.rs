@@ -249,6 +249,7 @@ impl Server {
         let id = self.rti.connect(now, peer.to_string());
         let interest = Interest::READABLE | Interest::WRITABLE;
         let ready = stream.set_nodelay(true).and_then(|()| {
+            keep_alive(&stream)?;
             self.poll
                 .registry()
                 .register(&mut stream, Token(id.index()), interest)
