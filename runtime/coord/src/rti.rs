@@ -255,8 +255,12 @@ enum Link {
     Unknown { deadline: PhysicalTime },
     /// This federate.
     Member(FederateId),
-    /// To be closed: what it sends is thrown away; closed by us at the deadline.
-    Closing { deadline: PhysicalTime },
+    /// To be closed: what it sends is thrown away; closed by us at the deadline. A stranger never was a federate: the
+    /// end does not wait for it.
+    Closing {
+        deadline: PhysicalTime,
+        stranger: bool,
+    },
 }
 
 /// One federate's connection and how far its join is.
@@ -514,7 +518,8 @@ impl Rti {
     fn close(&mut self, id: ConnectionId, closing: Closing) {
         let deadline = self.now + self.config.closing_timeout;
         let connection = &mut self.connections[id.0];
-        connection.link = Link::Closing { deadline };
+        let stranger = matches!(connection.link, Link::Unknown { .. });
+        connection.link = Link::Closing { deadline, stranger };
         connection.output.close(closing);
         self.queue_output(id);
     }

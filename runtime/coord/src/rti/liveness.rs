@@ -53,7 +53,7 @@ impl Rti {
             .iter()
             .filter_map(|connection| match connection.link {
                 Link::Unknown { deadline } => Some(deadline),
-                Link::Closing { deadline } if connection.output.closing() != Closing::Now => {
+                Link::Closing { deadline, .. } if connection.output.closing() != Closing::Now => {
                     Some(deadline)
                 }
                 Link::Closing { .. } | Link::Free | Link::Member(_) => None,
@@ -72,7 +72,7 @@ impl Rti {
                 self.events.push_back(RtiEvent::Rejected { peer, reason });
                 self.close(id, Closing::Now);
             }
-            Link::Closing { deadline } if deadline <= self.now => {
+            Link::Closing { deadline, .. } if deadline <= self.now => {
                 self.connections[id.0].output.close(Closing::Now);
                 self.queue_output(id);
             }
@@ -253,7 +253,11 @@ impl Rti {
         self.phase = Phase::Ended { code };
         self.events.push_back(RtiEvent::Ended { code });
         for index in 0..self.connections.len() {
-            if matches!(self.connections[index].link, Link::Unknown { .. }) {
+            let link = self.connections[index].link;
+            if matches!(
+                link,
+                Link::Unknown { .. } | Link::Closing { stranger: true, .. }
+            ) {
                 self.close(ConnectionId(index), Closing::Now);
             }
         }
