@@ -156,6 +156,8 @@ pub struct Counters {
     pub provisional: u64,
     /// Announcements (NET) that DNET made needless.
     pub skipped_announcements: u64,
+    /// Tags that had to wait because downstreams were too far behind.
+    pub held_back: u64,
 }
 
 /// One federate: a timeline and, when it is not alone, its link to the RTI.
@@ -304,7 +306,9 @@ impl Federate {
                 match self.timeline.ready(&mut self.batch) {
                     Progress::Batch => return Poll::Run,
                     Progress::InFlight => return Poll::Wait(None),
-                    Progress::Blocked if self.stop.abandoned() => self.timeline.abandon(),
+                    Progress::Blocked if self.stop.gives_up(self.timeline.at()) => {
+                        self.timeline.abandon();
+                    }
                     Progress::Blocked => return Poll::Wait(None),
                     Progress::TagDone => self.complete(),
                 }
@@ -365,6 +369,7 @@ impl Federate {
             let permission = link.permit(now, next, promise);
             if let Permission::Wait(until) = permission {
                 self.counters.skipped_announcements = link.skipped();
+                self.counters.held_back = link.held_back();
                 return Err(Poll::Wait(until));
             }
         }
@@ -379,6 +384,8 @@ impl Federate {
     }
 
     /// Nothing is left and nothing can come: the stop tag is the next microstep, unless told to keep alive.
+    ///
+    /// What is written there stays here, because FOREVER was announced.
     fn starve(&mut self) -> Option<Tag> {
         if self.config.keepalive || self.physical_delay.is_some() {
             return None;
@@ -418,12 +425,7 @@ impl Federate {
     }
 
     #[inline]
-    fn run_tag(
-        &mut self,
-        tag: Tag,
-        batch: &mut Vec<NodeId>,
-        executor: &mut impl FederateExecutor,
-    ) {
+    fn run_tag(&mut self, tag: Tag, batch: &mut Vec<NodeId>, executor: &mut impl FederateExecutor) {
         loop {
             self.counters.reactions += batch.len() as u64;
             for node in batch.iter() {
@@ -501,6 +503,9 @@ impl Federate {
         executor: &mut impl FederateExecutor,
     ) -> Result<(), Outcome> {
         self.counters.received += 1;
+        if self.stop.over(self.timeline.at()) {
+            return Ok(());
+        }
         let value = executor.decode(message.input, message.payload)?;
         match self.timeline.admit(message.input, message.tag, value) {
             Admission::Queued { .. } => Ok(()),

@@ -1,1 +1,13 @@
 //! Simulated network, clocks, hosts and faults with checkers; one seed drives all. Pure.
+
+pub mod clock;
+pub mod coverage;
+pub mod executor;
+pub mod network;
+pub mod observer;
+pub mod program;
+pub mod reference;
+pub mod scenario;
+pub mod seed;
+pub mod swarm;
+pub mod world;

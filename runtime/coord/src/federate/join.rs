@@ -258,7 +258,7 @@ impl Federate {
         message: &TaggedMessage<'_>,
         executor: &mut impl FederateExecutor,
     ) -> Result<(), Outcome> {
-        let Some(link) = &self.link else {
+        let Some(link) = &mut self.link else {
             return Ok(());
         };
         if message.federate != link.config.id {
@@ -267,6 +267,7 @@ impl Federate {
         let input = link
             .input(message.port)
             .ok_or(ProtocolError::UnknownPort(message.port))?;
+        link.message_arrived(message.tag);
         self.admit(
             &Incoming {
                 input,

@@ -1,5 +1,6 @@
 //! The link to the RTI under centralized coordination: what is announced (NET, LTC), granted (TAG, PTAG) and sent.
 
+use crate::mutants::Mutants;
 use crate::plan::{ClockSync, ConnectionPlan, Plan};
 use crate::topology::{FederateId, Topology, connection_delay, zero_delay_cycle_inputs};
 use crate::wire::{self, NeighborStructure, PortAbsent, ToRti};
@@ -39,6 +40,9 @@ pub struct LinkConfig {
     pub max_lead: Option<Duration>,
     /// Whether the program runs ahead of physical time.
     pub fast: bool,
+    /// Rules that are wrong; none but in tests.
+    #[doc(hidden)]
+    pub mutants: Mutants,
 }
 
 impl LinkConfig {
@@ -85,6 +89,7 @@ impl LinkConfig {
             extensions: plan.extensions,
             max_lead: plan.max_lead_ns.map(Duration::from_nanos),
             fast: plan.fast,
+            mutants: Mutants::NONE,
         }
     }
 }
@@ -123,8 +128,9 @@ pub(super) struct Link {
     out: Vec<u8>,
     granted: Tag,
     provisional: Option<Tag>,
-    /// The last announced tag (NET), sent or pending.
+    /// What the RTI takes for the next event here: the last NET, sent or pending, or the tag of a message since.
     announced: Tag,
+    /// The last NET that was found needless, until one is sent.
     skipped: Option<Tag>,
     skipped_count: u64,
     not_needed_through: Option<Tag>,
@@ -135,9 +141,14 @@ pub(super) struct Link {
     told_at: Vec<Tag>,
     senders: Vec<(NodeId, OutputId)>,
     unconfirmed: VecDeque<Sent>,
+    /// The last tag that had to wait for downstreams, and how many had to.
+    held_back: Tag,
+    held_back_count: u64,
+    /// Nothing more may be sent: it was promised.
+    silent: bool,
 }
 
-/// A run of tags at which messages were sent that no downstream has confirmed.
+/// A run of messages that downstreams have not confirmed, by the tags they have there.
 #[derive(Debug)]
 struct Sent {
     first: Tag,
@@ -165,6 +176,9 @@ impl Link {
             told_at: vec![Tag::NEVER; nodes],
             senders,
             unconfirmed: VecDeque::new(),
+            held_back: Tag::NEVER,
+            held_back_count: 0,
+            silent: false,
             config,
         }
     }
@@ -181,12 +195,16 @@ impl Link {
         self.skipped_count
     }
 
+    pub(super) fn held_back(&self) -> u64 {
+        self.held_back_count
+    }
+
     /// What was promised to downstreams: no event from outside may get an earlier tag.
     pub(super) fn announced(&self) -> Tag {
         if self.config.downstream.is_empty() {
             return Tag::NEVER;
         }
-        self.announced.max(self.skipped.unwrap_or(Tag::NEVER))
+        self.announced
     }
 
     /// The tag of a provisional grant that is still to be executed, FOREVER when there is none.
@@ -240,6 +258,7 @@ impl Link {
             return Permission::Wait(None);
         }
         if self.too_far_ahead(next) {
+            self.held_back_count += u64::from(std::mem::replace(&mut self.held_back, next) != next);
             Permission::Wait(None)
         } else {
             Permission::Enter
@@ -267,6 +286,7 @@ impl Link {
     #[inline]
     fn announce(&mut self, next: Tag) {
         if next == self.announced {
+            self.skipped = None;
             return;
         }
         let needed = self.not_needed_through.is_none_or(|through| through < next)
@@ -278,6 +298,15 @@ impl Link {
         } else if self.skipped != Some(next) {
             self.skipped = Some(next);
             self.skipped_count += 1;
+        }
+    }
+
+    /// A message has come: the RTI counts its tag as announced if it is earlier than what was.
+    #[inline]
+    pub(super) fn message_arrived(&mut self, tag: Tag) {
+        if tag < self.announced {
+            self.announced = tag;
+            self.pending_announcement = self.pending_announcement.map(|pending| pending.min(tag));
         }
     }
 
@@ -351,7 +380,7 @@ impl Link {
         self.told_at[node.index()] = at;
         let link = self.config.outputs[output.index()];
         let tag = at.delayed(link.delay);
-        if tag > timeline.stop_tag() || tag == Tag::FOREVER {
+        if self.silent || tag > timeline.stop_tag() || tag == Tag::FOREVER {
             return false;
         }
         wire::encode_tagged_message(link.port_id, link.federate, tag, &mut self.out, payload);
@@ -361,12 +390,10 @@ impl Link {
         if self.flow_controlled() {
             let grain = self.grain();
             match self.unconfirmed.back_mut() {
-                Some(run) if at.time < run.first.time + grain => {
-                    run.last = at;
-                }
+                Some(run) if tag.time < run.first.time + grain => run.last = run.last.max(tag),
                 Some(_) | None => self.unconfirmed.push_back(Sent {
-                    first: at,
-                    last: at,
+                    first: tag,
+                    last: tag,
                 }),
             }
         }
@@ -393,15 +420,14 @@ impl Link {
         }
     }
 
-    /// Takes DOWNSTREAM_CONFIRMED: every message sent up to `through` was handled.
+    /// Takes DOWNSTREAM_CONFIRMED: every message for a tag up to `through` was handled.
     pub(super) fn downstream_confirmed(&mut self, through: Tag) {
-        while let Some(run) = self.unconfirmed.front_mut() {
-            if run.last <= through {
-                self.unconfirmed.pop_front();
-            } else {
-                run.first = run.first.max(through);
-                break;
-            }
+        while self
+            .unconfirmed
+            .front()
+            .is_some_and(|run| run.last <= through)
+        {
+            self.unconfirmed.pop_front();
         }
     }
 
@@ -422,6 +448,11 @@ impl Link {
                 ToRti::PortAbsent(absent).encode(&mut self.out);
             }
         }
+    }
+
+    /// From now on nothing is sent to other federates: they have been told that nothing will come.
+    pub(super) fn fall_silent(&mut self) {
+        self.silent = true;
     }
 
     /// Appends a message that nothing can supersede.

@@ -9,7 +9,7 @@ use ictus_core::{PhysicalTime, Tag, Timeline};
 #[derive(Debug, Default)]
 pub(super) struct Stop {
     consensus: Consensus,
-    /// The first tag at which a lost federate's silence could be mistaken for absence.
+    /// The last tag at which a lost federate's silence is no false absence.
     limit: Option<Tag>,
     lost: Option<u16>,
     abandoned: Option<Outcome>,
@@ -32,8 +32,8 @@ impl Stop {
             return true;
         }
         match self.consensus {
-            Consensus::None => self.limit.is_none_or(|limit| next < limit),
-            Consensus::Barred(bar) => next < bar && self.limit.is_none_or(|limit| next < limit),
+            Consensus::None => self.limit.is_none_or(|limit| next <= limit),
+            Consensus::Barred(bar) => next < bar && self.limit.is_none_or(|limit| next <= limit),
             Consensus::Granted => true,
         }
     }
@@ -41,13 +41,21 @@ impl Stop {
     /// Whether nothing but shutdown may run any more.
     #[inline]
     pub(super) fn only_shutdown(&self, next: Tag) -> bool {
-        self.abandoned.is_some()
-            || (self.consensus == Consensus::Granted
-                && self.limit.is_some_and(|limit| next >= limit))
+        self.abandoned.is_some() || (self.consensus == Consensus::Granted && self.past_limit(next))
     }
 
-    pub(super) fn abandoned(&self) -> bool {
-        self.abandoned.is_some()
+    fn past_limit(&self, tag: Tag) -> bool {
+        self.limit.is_some_and(|limit| tag > limit)
+    }
+
+    /// Whether reactions that wait for inputs at `at` wait in vain: what they wait for is lost.
+    pub(super) fn gives_up(&self, at: Tag) -> bool {
+        self.abandoned.is_some() || (self.consensus == Consensus::Granted && self.past_limit(at))
+    }
+
+    /// Whether messages have come too late to matter: nothing but shutdown runs, or has run, at `at`.
+    pub(super) fn over(&self, at: Tag) -> bool {
+        self.only_shutdown(at)
     }
 }
 
@@ -107,7 +115,7 @@ impl Federate {
             .push_back(FederateEvent::StopGranted(self.timeline.stop_tag()));
     }
 
-    /// Takes FEDERATE_LOST: from `limit` on, an absence could be a lie.
+    /// Takes FEDERATE_LOST: after `limit`, an absence could be a lie.
     pub(super) fn peer_lost(&mut self, federate: u16, limit: Tag) {
         self.stop.limit = Some(self.stop.limit.map_or(limit, |earlier| earlier.min(limit)));
         if self.stop.lost.is_none() {

@@ -1,0 +1,57 @@
+//! Every mutant, against the seeds until one catches it.
+
+use super::{Options, check};
+use ictus_coord::mutants::{Mutant, Mutants};
+use std::io::{self, Write};
+use std::sync::atomic::{AtomicU64, Ordering};
+
+/// Seeds tried when none are asked for.
+const SEEDS: u64 = 2_000;
+
+pub(super) fn run(options: &Options, out: &mut impl Write) -> io::Result<bool> {
+    let seeds = if options.seeds == 0 { SEEDS } else { options.seeds };
+    let quiet = std::panic::take_hook();
+    std::panic::set_hook(Box::new(|_| {}));
+    let next = AtomicU64::new(0);
+    let rows = std::sync::Mutex::new(Vec::new());
+    std::thread::scope(|scope| {
+        for _ in 0..super::THREADS {
+            scope.spawn(|| {
+                loop {
+                    let index = usize::try_from(next.fetch_add(1, Ordering::Relaxed)).unwrap_or(0);
+                    let Some(mutant) = Mutant::ALL.get(index) else { return };
+                    let row = hunt(*mutant, seeds);
+                    rows.lock().expect("hunters do not panic").push((index, row));
+                }
+            });
+        }
+    });
+    std::panic::set_hook(quiet);
+    let mut rows = rows.into_inner().expect("hunters do not panic");
+    rows.sort_unstable_by_key(|row| row.0);
+    writeln!(out, "{:<26} {:>9} {:>6}  caught by", "mutant", "seed", "tried")?;
+    let mut caught = 0;
+    for (index, row) in &rows {
+        let mutant = Mutant::ALL[*index];
+        match row {
+            Some((seed, words)) => {
+                caught += 1;
+                let name = format!("{mutant:?}");
+                writeln!(out, "{name:<26} {seed:>#9x} {seed:>6}  {words}")?;
+            }
+            None => writeln!(out, "{:<26} {:>9} {seeds:>6}  -", format!("{mutant:?}"), "-")?,
+        }
+    }
+    writeln!(out, "{caught} of {} mutants caught", rows.len())?;
+    Ok(caught == rows.len())
+}
+
+fn hunt(mutant: Mutant, seeds: u64) -> Option<(u64, String)> {
+    (1..=seeds).find_map(|seed| {
+        let (_, violation) = check(seed, Mutants::only(mutant), false);
+        violation.map(|violation| {
+            let words: String = violation.to_string().chars().take(110).collect();
+            (seed, words)
+        })
+    })
+}

@@ -1,0 +1,389 @@
+//! One seed, one verdict: generate, run, run again differently, compare with the program alone.
+
+use crate::coverage::{Coverage, Feature};
+use crate::executor::{Record, SyntheticExecutor};
+use crate::observer::{Observer, Violation};
+use crate::program::Federation;
+use crate::reference::{OutsideEvent, reference};
+use crate::seed::{Rng, mix};
+use crate::swarm::{Ending, Swarm};
+use crate::world::{Conditions, Ended, Member, Run, Victim, World};
+use ictus_coord::federate::{FederateConfig, LinkConfig, Outcome};
+use ictus_coord::mutants::Mutants;
+use ictus_coord::topology::{FederateId, Topology, connection_delay};
+use ictus_core::{Delay, Duration, Tag};
+use std::collections::BTreeMap;
+
+/// What a seed showed.
+#[derive(Debug)]
+pub struct Verdict {
+    /// The options it drew.
+    pub swarm: Swarm,
+    /// The first broken law.
+    pub violation: Option<Violation>,
+    /// What happened.
+    pub coverage: Coverage,
+    /// Tags completed by all federates.
+    pub tags: u64,
+    /// Equal for equal runs.
+    pub hash: u64,
+    /// Every message of the first run, if asked for.
+    pub log: Option<String>,
+}
+
+/// Checks one seed.
+#[must_use]
+pub fn check_seed(seed: u64, mutants: Mutants) -> Verdict {
+    check_seed_logged(seed, mutants, false)
+}
+
+/// Checks one seed and keeps a log of its first run if asked to.
+#[must_use]
+pub fn check_seed_logged(seed: u64, mutants: Mutants, log: bool) -> Verdict {
+    let mut rng = Rng::new(seed);
+    let swarm = Swarm::draw(&mut rng);
+    let federation = Federation::generate(&swarm, &mut rng);
+    let mut first = simulate(&federation, &swarm, mutants, &rng.fork(1), log);
+    let mut verdict = Verdict {
+        violation: first.violation().cloned(),
+        coverage: first.observer.coverage.clone(),
+        tags: first.members.iter().map(|m| m.tags).sum(),
+        hash: hash(&first),
+        log: first.observer.log.take(),
+        swarm,
+    };
+    cover_structure(&federation, &mut verdict.coverage, &verdict.swarm);
+    if verdict.violation.is_some() {
+        return verdict;
+    }
+    verdict.violation = judge(&federation, &verdict.swarm, &first).err();
+    if verdict.violation.is_none() && seed.is_multiple_of(4) {
+        // Another network and other batches: the same laws, the same reference.
+        let second = simulate(&federation, &verdict.swarm, mutants, &rng.fork(2), false);
+        verdict.hash = mix(verdict.hash, hash(&second));
+        verdict.violation = second
+            .violation()
+            .cloned()
+            .or_else(|| judge(&federation, &verdict.swarm, &second).err());
+        verdict.coverage.merge(&second.observer.coverage);
+    }
+    verdict
+}
+
+/// The federation of a seed in words: reactors, reactions, connections.
+#[must_use]
+pub fn describe(seed: u64) -> String {
+    let mut rng = Rng::new(seed);
+    let swarm = Swarm::draw(&mut rng);
+    Federation::generate(&swarm, &mut rng).to_string()
+}
+
+/// Runs a federation once.
+#[must_use]
+pub fn simulate(
+    federation: &Federation,
+    swarm: &Swarm,
+    mutants: Mutants,
+    rng: &Rng,
+    log: bool,
+) -> Run<SyntheticExecutor> {
+    let plan = federation.plan();
+    let topology = remote_topology(federation);
+    let delays = plan
+        .connections
+        .iter()
+        .map(|c| ((c.to.federate, c.port_id), connection_delay(c)))
+        .collect::<BTreeMap<_, _>>();
+    let payload = if rng.fork(9).percent(10) { 3_000 } else { 0 };
+    let members = (0..federation.federates.len()).map(|id| {
+        let assembly = federation
+            .federate(id, swarm.mode.parallel)
+            .expect("a federate of a federation without loops has none");
+        let id = u16::try_from(id).unwrap_or(u16::MAX);
+        let mut link = LinkConfig::from_plan(&plan, id, &assembly.inputs, &assembly.outputs);
+        link.federation.clone_from(&plan.federation);
+        Member {
+            program: assembly.program.clone(),
+            link,
+            executor: SyntheticExecutor::new(assembly, payload),
+        }
+    });
+    let conditions = Conditions {
+        swarm: swarm.clone(),
+        config: FederateConfig {
+            timeout: federation.timeout,
+            fast: federation.fast,
+            keepalive: false,
+        },
+        mutants,
+    };
+    let mut observer = Observer::new(topology, delays);
+    observer.log = log.then(String::new);
+    World::new(members.collect(), observer, conditions, rng).run()
+}
+
+fn remote_topology(federation: &Federation) -> Topology {
+    let remote = federation.links.iter().filter(|l| l.from.0 != l.to.0);
+    Topology::new(
+        federation.federates.len(),
+        remote.map(|l| {
+            let id = FederateId::from_index;
+            (id(l.from.0), id(l.to.0), l.delay)
+        }),
+    )
+}
+
+/// The checkers that look at a run when it is over.
+fn judge(
+    federation: &Federation,
+    swarm: &Swarm,
+    run: &Run<SyntheticExecutor>,
+) -> Result<(), Violation> {
+    check_outcomes(run)?;
+    for (index, member) in run.members.iter().enumerate() {
+        if let Some(node) = member.executor.unstable() {
+            return Err(Violation {
+                checker: "executor",
+                what: format!("in federate {index} what {node:?} reads changed while it ran"),
+            });
+        }
+    }
+    if run.start.is_some() {
+        check_stops(swarm, run)?;
+        check_trace(federation, swarm, run)?;
+    }
+    Ok(())
+}
+
+fn check_outcomes(run: &Run<SyntheticExecutor>) -> Result<(), Violation> {
+    for (index, member) in run.members.iter().enumerate() {
+        let right = match (&member.outcome, run.victim) {
+            (None, Some(Victim::Federate(victim))) => victim == index,
+            (None, Some(Victim::Rti)) => run.start.is_none(),
+            (None, None) => false,
+            (Some(Outcome::Stopped), _) => true,
+            (Some(Outcome::PeerLost(lost)), Some(Victim::Federate(victim))) => {
+                usize::from(*lost) == victim
+            }
+            (Some(Outcome::RtiFailed), Some(Victim::Federate(_))) => run.start.is_none(),
+            (Some(Outcome::RtiLost), Some(Victim::Rti)) => true,
+            (Some(_), _) => false,
+        };
+        if !right {
+            let words = member.outcome.as_ref().map(ToString::to_string);
+            return Err(Violation {
+                checker: "outcome",
+                what: format!("federate {index}: {words:?}, victim {:?}", run.victim),
+            });
+        }
+    }
+    Ok(())
+}
+
+/// Every record must be one of the reference, and every one of the reference must be there, as far as the run went.
+fn check_trace(
+    federation: &Federation,
+    swarm: &Swarm,
+    run: &Run<SyntheticExecutor>,
+) -> Result<(), Violation> {
+    let Some(start) = run.start else { return Ok(()) };
+    let events: Vec<OutsideEvent> = run
+        .members
+        .iter()
+        .enumerate()
+        .flat_map(|(federate, m)| m.executor.outside_events(federate, start))
+        .collect();
+    let stop = common_stop(run, start);
+    let mut expected = reference(federation, &events, stop);
+    expected.sort_unstable();
+    for (index, member) in run.members.iter().enumerate() {
+        let first = federation.first_reactor(index);
+        let last = first + federation.federates[index].reactors.len();
+        let mine = |r: &&Record| (first..last).contains(&(r.reactor as usize));
+        let limit = Limit::new(member.stop, member.at, run, index, swarm);
+        let mut actual: Vec<Record> = member.executor.trace().to_vec();
+        actual.sort_unstable();
+        check_limit(index, &limit, &actual, start)?;
+        let wanted = expected.iter().filter(mine);
+        let wanted: Vec<Record> = wanted.filter(|r| limit.covers(r, start)).copied().collect();
+        let got: Vec<Record> = actual.into_iter().filter(|r| limit.covers(r, start)).collect();
+        compare(federation, index, &wanted, &got)?;
+    }
+    Ok(())
+}
+
+/// Where the reference stops.
+fn common_stop(run: &Run<SyntheticExecutor>, start: Tag) -> Option<(Duration, u32)> {
+    let stop = survivors(run).map(|(_, m)| m.stop).max()?;
+    (stop != Tag::FOREVER).then(|| since(stop, start))
+}
+
+/// The federates that did not die.
+fn survivors(run: &Run<SyntheticExecutor>) -> impl Iterator<Item = (usize, &Ended<SyntheticExecutor>)> {
+    let died = move |index: usize| run.victim == Some(Victim::Federate(index));
+    run.members.iter().enumerate().filter(move |(index, _)| !died(*index))
+}
+
+/// All who take part in a stop stop at the same tag.
+fn check_stops(swarm: &Swarm, run: &Run<SyntheticExecutor>) -> Result<(), Violation> {
+    if run.victim == Some(Victim::Rti) || swarm.ending == Ending::Starvation {
+        return Ok(());
+    }
+    let mut stops = survivors(run);
+    let Some((first, member)) = stops.next() else { return Ok(()) };
+    match stops.find(|(_, other)| other.stop != member.stop) {
+        Some((second, other)) => Err(Violation {
+            checker: "stop",
+            what: format!("{first} stopped at {}, {second} at {}", member.stop, other.stop),
+        }),
+        None => Ok(()),
+    }
+}
+
+fn since(tag: Tag, start: Tag) -> (Duration, u32) {
+    (tag.time - start.time, tag.microstep)
+}
+
+/// Up to which tag a federate's records can be compared.
+#[derive(Debug)]
+struct Limit {
+    /// The last tag.
+    last: Tag,
+    /// Ordinary reactions may run up to here, and again nothing but shutdown at the stop tag.
+    promise: Option<Tag>,
+    stop: Tag,
+}
+
+impl Limit {
+    fn new(
+        stop: Tag,
+        at: Tag,
+        run: &Run<SyntheticExecutor>,
+        index: usize,
+        swarm: &Swarm,
+    ) -> Self {
+        let promise = run.observer.promise(index);
+        let before_stop = stop.latest_earlier();
+        let last = match run.victim {
+            // It may have died amid a tag.
+            Some(Victim::Federate(victim)) if victim == index => {
+                let agreed = survivors(run).map(|(_, m)| m.stop).max();
+                at.min(agreed.unwrap_or(at)).latest_earlier()
+            }
+            Some(Victim::Federate(_)) => promise.map_or(stop, |p| p.min(stop)),
+            // The last tag may have been left half done, and shutdown ran early.
+            Some(Victim::Rti) if at >= stop => before_stop.latest_earlier(),
+            Some(Victim::Rti) => at.latest_earlier(),
+            None if swarm.ending == Ending::Starvation => before_stop,
+            None => stop,
+        };
+        Self {
+            last,
+            promise,
+            stop,
+        }
+    }
+
+    fn covers(&self, record: &Record, start: Tag) -> bool {
+        (record.time, record.microstep) <= since(self.last, start)
+    }
+}
+
+/// No ordinary reaction past the promise of a lost one.
+fn check_limit(
+    index: usize,
+    limit: &Limit,
+    records: &[Record],
+    start: Tag,
+) -> Result<(), Violation> {
+    let Some(promise) = limit.promise else { return Ok(()) };
+    let (promise, stop) = (since(promise, start), since(limit.stop, start));
+    let past = records
+        .iter()
+        .find(|r| (r.time, r.microstep) > promise && (r.time, r.microstep) < stop);
+    match past {
+        Some(record) => Err(Violation {
+            checker: "promise",
+            what: format!("federate {index} ran {record:?} past {promise:?}, stop {stop:?}"),
+        }),
+        None => Ok(()),
+    }
+}
+
+fn compare(
+    federation: &Federation,
+    index: usize,
+    wanted: &[Record],
+    got: &[Record],
+) -> Result<(), Violation> {
+    if wanted == got {
+        return Ok(());
+    }
+    let place = wanted.iter().zip(got).take_while(|(w, g)| w == g).count();
+    let name = |record: Option<&Record>| {
+        record.map_or("nothing".to_owned(), |r| {
+            let path = federation.paths().nth(r.reactor as usize).unwrap_or("?");
+            format!("{path}#{} at {}+{} ({:x})", r.reaction, r.time, r.microstep, r.effects)
+        })
+    };
+    Err(Violation {
+        checker: "determinism",
+        what: format!(
+            "federate {index}, record {place}: expected {}, got {}",
+            name(wanted.get(place)),
+            name(got.get(place))
+        ),
+    })
+}
+
+fn hash(run: &Run<SyntheticExecutor>) -> u64 {
+    let mut hash = run.duration.as_nanos().cast_unsigned();
+    for member in &run.members {
+        for record in member.executor.trace() {
+            let tag = mix(record.time.as_nanos().cast_unsigned(), u64::from(record.microstep));
+            hash = mix(hash, mix(tag, record.effects));
+        }
+    }
+    hash
+}
+
+/// Counts what follows from the structure alone.
+fn cover_structure(federation: &Federation, coverage: &mut Coverage, swarm: &Swarm) {
+    let topology = remote_topology(federation);
+    let ids: Vec<FederateId> = topology.federates().collect();
+    let in_zero_delay_cycle = |f: &FederateId| topology.in_zero_delay_cycle(*f);
+    let apart = ids.iter().filter(|f| in_zero_delay_cycle(f)).any(|a| {
+        ids.iter().filter(|f| in_zero_delay_cycle(f)).any(|b| {
+            topology.path(*a, *b).is_some() && !topology.share_zero_delay_cycle(*a, *b) && a != b
+        })
+    });
+    let hits = [
+        (Feature::TwoZeroDelayCycles, apart),
+        (
+            Feature::AnsweringPair,
+            swarm.shape.zero_delay_cycles && ids.iter().any(|f| in_zero_delay_cycle(&f)),
+        ),
+        (
+            Feature::Cycle,
+            ids.iter()
+                .any(|f| topology.in_cycle(*f) && !topology.in_zero_delay_cycle(*f)),
+        ),
+        (
+            Feature::SelfContained,
+            federation.links.iter().any(|l| l.from.0 == l.to.0 && l.delay != Delay::None),
+        ),
+        (
+            Feature::Alone,
+            ids.iter()
+                .any(|f| topology.upstream(*f).is_empty() && topology.downstream(*f).is_empty()),
+        ),
+        (Feature::Fast, swarm.mode.fast),
+        (Feature::StopByReaction, swarm.ending == Ending::ReactionStop),
+        (Feature::Starvation, swarm.ending == Ending::Starvation),
+    ];
+    for (feature, hit) in hits {
+        if hit {
+            coverage.hit(feature);
+        }
+    }
+}

@@ -1,0 +1,360 @@
+//! One host: a federate, its clock, its connection, driven as a real driver would.
+
+use super::{Conditions, Ended, Event, Member, World};
+use crate::clock::HostClock;
+use crate::coverage::Feature;
+use crate::executor::SimulatedExecutor;
+use crate::network::{Arrival, Pipe};
+use crate::observer::Position;
+use crate::seed::Rng;
+use ictus_coord::federate::{Counters, Federate, FederateEvent, Poll};
+use ictus_core::{Duration, NodeId, PhysicalTime, Tag};
+
+/// One host with one federate.
+#[derive(Debug)]
+pub(super) struct Host<E> {
+    pub(super) federate: Federate,
+    pub(super) executor: E,
+    pub(super) clock: HostClock,
+    /// To the RTI.
+    pub(super) up: Pipe,
+    /// From the RTI.
+    pub(super) down: Pipe,
+    rng: Rng,
+    state: State,
+    received: Vec<u8>,
+    /// Bytes of the federate's output that the observer has seen.
+    shown: usize,
+    wake_at: Option<i64>,
+    busy_until: i64,
+    /// Nodes in flight, in the order in which they started.
+    in_flight: Vec<NodeId>,
+    batches: usize,
+    finished_writing: bool,
+}
+
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+enum State {
+    Waiting,
+    Alive,
+    Over,
+    Dead,
+}
+
+impl<E: SimulatedExecutor> Host<E> {
+    pub(super) fn new(member: Member<E>, conditions: &Conditions, mut rng: Rng) -> Self {
+        let clocks = conditions.swarm.clocks;
+        let offset = rng.span(-clocks.offset, clocks.offset);
+        let ppm = Duration::from_nanos(clocks.drift);
+        let drift = rng.span(-ppm, ppm).as_nanos();
+        let network = conditions.swarm.network;
+        let mut link = member.link;
+        link.mutants = conditions.mutants;
+        Self {
+            federate: Federate::federated(member.program, conditions.config.clone(), link),
+            executor: member.executor,
+            clock: HostClock::new(offset, drift),
+            up: Pipe::new(rng.fork(1), network),
+            down: Pipe::new(rng.fork(2), network),
+            rng,
+            state: State::Waiting,
+            received: Vec::new(),
+            shown: 0,
+            wake_at: None,
+            busy_until: 0,
+            in_flight: Vec::new(),
+            batches: 0,
+            finished_writing: false,
+        }
+    }
+
+    pub(super) fn counters(&self) -> Counters {
+        self.federate.counters()
+    }
+
+    pub(super) fn into_ended(self) -> Ended<E> {
+        let timeline = self.federate.timeline();
+        Ended {
+            stop: timeline.stop_tag(),
+            at: timeline.at(),
+            tags: self.federate.counters().tags,
+            outcome: (self.state == State::Over).then(|| self.federate.into_outcome()).flatten(),
+            executor: self.executor,
+        }
+    }
+
+    pub(super) fn is_over(&self) -> bool {
+        matches!(self.state, State::Over | State::Dead)
+    }
+
+    pub(super) fn position(&self) -> Position {
+        let timeline = self.federate.timeline();
+        if timeline.start_tag() == Tag::NEVER {
+            return Position::NOWHERE;
+        }
+        let executing = timeline.current().is_some();
+        let next = if self.is_over() || timeline.finished() {
+            Tag::FOREVER
+        } else if executing && !self.executor.quiet() {
+            timeline.at()
+        } else {
+            timeline.next_tag()
+        };
+        Position {
+            at: timeline.at(),
+            executing,
+            next,
+            stop: timeline.stop_tag(),
+        }
+    }
+
+    pub(super) fn woken(&mut self, now: i64) -> bool {
+        if self.wake_at.is_some_and(|at| at <= now) {
+            self.wake_at = None;
+        }
+        self.state == State::Alive
+    }
+
+    pub(super) fn wants_wake(&mut self, at: i64) -> bool {
+        let sooner = self.wake_at.is_none_or(|planned| at < planned);
+        if sooner {
+            self.wake_at = Some(at);
+        }
+        sooner && self.state == State::Alive
+    }
+
+    pub(super) fn die(&mut self, now: i64, lose: bool, wakes: &mut Vec<i64>) {
+        self.state = State::Dead;
+        self.up.break_off(now, lose, wakes);
+    }
+}
+
+impl<E: SimulatedExecutor> World<E> {
+    pub(super) fn connect(&mut self, federate: usize) {
+        if self.rti.is_dead() {
+            self.hosts[federate].state = State::Dead;
+            return;
+        }
+        let host = &mut self.hosts[federate];
+        if host.state != State::Waiting {
+            return;
+        }
+        host.state = State::Alive;
+        host.federate.connect();
+        self.rti.accept(self.now, federate);
+        self.drive(federate);
+    }
+
+    /// Reads, polls, runs, writes, waits.
+    pub(super) fn drive(&mut self, federate: usize) {
+        if self.hosts[federate].state != State::Alive {
+            return;
+        }
+        let busy = self.hosts[federate].busy_until;
+        if busy > self.now {
+            self.wake(federate, busy);
+            return;
+        }
+        self.read(federate);
+        self.poll(federate);
+        self.show(federate);
+        self.take_events(federate);
+    }
+
+    fn read(&mut self, federate: usize) {
+        let host = &mut self.hosts[federate];
+        let now = host.clock.reading(self.now);
+        let mut gone = false;
+        while let Some(arrival) = host.down.take(self.now) {
+            match arrival {
+                Arrival::Bytes(bytes) => host.received.extend_from_slice(&bytes),
+                Arrival::Eof | Arrival::Reset => gone = true,
+            }
+        }
+        if !host.received.is_empty() {
+            let position = host.position();
+            let used = host.federate.receive(now, &host.received, &mut host.executor);
+            self.observer
+                .federate_read(federate, &host.received[..used], position);
+            if used < host.received.len() {
+                self.observer.coverage.hit(Feature::SplitMessage);
+            }
+            host.received.drain(..used);
+        }
+        if gone {
+            host.federate.handle_disconnect();
+        }
+    }
+
+    fn poll(&mut self, federate: usize) {
+        loop {
+            let host = &mut self.hosts[federate];
+            let now = host.clock.reading(self.now);
+            match host.federate.poll(now, &mut host.executor) {
+                Poll::Run => {
+                    if !self.start_batch(federate) {
+                        break;
+                    }
+                }
+                Poll::Wait(until) => {
+                    self.write(federate);
+                    self.wait(federate, until);
+                    break;
+                }
+                Poll::Ended => {
+                    self.write(federate);
+                    let host = &mut self.hosts[federate];
+                    host.up.close(self.now, &mut self.wakes);
+                    host.state = State::Over;
+                    self.wake_rti_for_arrivals();
+                    break;
+                }
+            }
+        }
+        let position = self.hosts[federate].position();
+        self.observer.federate_ran(federate, position);
+    }
+
+    /// Starts what is ready; says whether to go on polling at once.
+    fn start_batch(&mut self, federate: usize) -> bool {
+        let mode = self.conditions.swarm.mode;
+        let host = &mut self.hosts[federate];
+        host.batches += 1;
+        let batch = host.federate.batch().to_vec();
+        for node in &batch {
+            host.executor.observe(*node);
+        }
+        if mode.parallel {
+            for node in batch {
+                let host = &mut self.hosts[federate];
+                host.in_flight.push(node);
+                let takes = host.rng.span(Duration::ZERO, mode.reaction).as_nanos();
+                self.at(self.now + takes, Event::Done(federate, node));
+            }
+            return true;
+        }
+        host.federate.run_batch(&mut host.executor);
+        let takes = host.rng.span(Duration::ZERO, mode.reaction).as_nanos();
+        if takes > 0 {
+            host.busy_until = self.now + takes;
+            let until = host.busy_until;
+            self.wake(federate, until);
+            return false;
+        }
+        if host.batches.is_multiple_of(mode.slice) {
+            self.write(federate);
+            self.wake(federate, self.now + 1_000);
+            return false;
+        }
+        true
+    }
+
+    /// A reaction in flight is done.
+    pub(super) fn node_done(&mut self, federate: usize, node: NodeId) {
+        let host = &mut self.hosts[federate];
+        if host.state != State::Alive {
+            return;
+        }
+        let place = host.in_flight.iter().position(|n| *n == node);
+        match place {
+            Some(0) => {}
+            Some(_) => self.observer.coverage.hit(Feature::OutOfOrder),
+            None => return,
+        }
+        host.in_flight.retain(|n| *n != node);
+        let tag = host.federate.timeline().at();
+        host.federate.run_node(node, tag, &mut host.executor);
+        host.federate.finish(&[node]);
+        self.drive(federate);
+    }
+
+    fn write(&mut self, federate: usize) {
+        self.hosts[federate].federate.flush();
+        self.show(federate);
+        let host = &mut self.hosts[federate];
+        if let Some(output) = host.federate.output() {
+            host.up.write(self.now, output, &mut self.wakes);
+            output.clear();
+            host.shown = 0;
+        }
+        if host.federate.resigned() && !host.finished_writing {
+            host.finished_writing = true;
+            host.up.close(self.now, &mut self.wakes);
+        }
+        self.wake_rti_for_arrivals();
+    }
+
+    fn wait(&mut self, federate: usize, until: Option<PhysicalTime>) {
+        let host = &self.hosts[federate];
+        if let Some(at) = until.and_then(|until| host.clock.when(until)) {
+            self.wake(federate, at);
+        }
+    }
+
+    /// Lets the observer see what the federate has written, flushed or not.
+    fn show(&mut self, federate: usize) {
+        let host = &mut self.hosts[federate];
+        let shown = host.shown;
+        if let Some(output) = host.federate.output() {
+            host.shown = output.len();
+            self.observer.federate_wrote(federate, &output[shown..]);
+        }
+    }
+
+    fn take_events(&mut self, federate: usize) {
+        while let Some(event) = self.hosts[federate].federate.poll_event() {
+            match event {
+                FederateEvent::ClockOffset(offset) => {
+                    self.hosts[federate].clock.correct(offset);
+                    if offset != Duration::ZERO {
+                        self.observer.coverage.hit(Feature::ClockOffset);
+                    }
+                }
+                FederateEvent::Started(start) => {
+                    let clock = self.hosts[federate].clock;
+                    let at = clock.when(start.time.as_physical()).unwrap_or(self.now);
+                    self.plan_run(at.max(self.now));
+                }
+                FederateEvent::Joined
+                | FederateEvent::Running
+                | FederateEvent::StopRequested
+                | FederateEvent::StopGranted(_)
+                | FederateEvent::PeerLost(_) => {}
+            }
+        }
+    }
+
+    /// Something happens outside: a physical action, stamped by a thread that is a little ahead of the federate.
+    pub(super) fn outside(&mut self, federate: usize) {
+        let now = self.now;
+        let host = &mut self.hosts[federate];
+        if host.state != State::Alive || host.federate.resigned() {
+            return;
+        }
+        let next = host.rng.span(Duration::from_micros(200), Duration::from_millis(15));
+        let late = host.rng.span(Duration::ZERO, Duration::from_micros(400));
+        let draw = host.rng.bits();
+        let started = host.federate.timeline().start_tag() != Tag::NEVER;
+        if started && let Some((action, value)) = host.executor.outside(draw) {
+            let stamp = host.clock.reading(now - late.as_nanos());
+            let tag = host.federate.schedule_physical(stamp, action, value);
+            host.executor.stamped(tag);
+            self.observer.coverage.hit(Feature::PhysicalAction);
+            if tag.time > stamp.as_logical() && tag.microstep == 0 {
+                self.observer.coverage.hit(Feature::PhysicalDeferred);
+            }
+            self.drive(federate);
+        }
+        self.at(now + next.as_nanos(), Event::Outside(federate));
+    }
+
+    pub(super) fn ask_stop(&mut self, federate: usize) {
+        let host = &mut self.hosts[federate];
+        if host.state == State::Alive {
+            let now = host.clock.reading(self.now);
+            host.federate.request_stop(now);
+            self.observer.coverage.hit(Feature::StopFromOutside);
+            self.drive(federate);
+        }
+    }
+}
