@@ -8,6 +8,7 @@ use ictus_deploy::Checked;
 use ictusd::api::{Event, Happening, Outcome};
 use ictusd::client::Client;
 use ictusd::store::Directory;
+use tokio::signal::unix::{Signal, SignalKind, signal};
 
 use crate::error::{CliError, Kind};
 use crate::session::{Session, request, succeed};
@@ -23,6 +24,8 @@ pub(crate) struct Runs<'a> {
     client: Client,
     checked: &'a Checked,
     limit: Duration,
+    /// One for the whole command: a Ctrl-C between two waits counts, too.
+    interrupts: Signal,
     names: Vec<String>,
 }
 
@@ -47,6 +50,7 @@ impl<'a> Runs<'a> {
             client,
             checked,
             limit,
+            interrupts: signal(SignalKind::interrupt()).map_err(CliError::failed)?,
             names: Vec::new(),
         })
     }
@@ -145,7 +149,7 @@ impl<'a> Runs<'a> {
     }
 
     async fn bounded<T>(
-        &self,
+        &mut self,
         work: impl Future<Output = Result<T, CliError>>,
     ) -> Result<T, CliError> {
         tokio::select! {
@@ -153,7 +157,7 @@ impl<'a> Runs<'a> {
                 let seconds = self.limit.as_secs();
                 Err(CliError::new(Kind::Timeout, format!("a run did not end within {seconds} s")))
             }),
-            _ = tokio::signal::ctrl_c() => Err(CliError::failed("interrupted")),
+            _ = self.interrupts.recv() => Err(CliError::failed("interrupted")),
         }
     }
 }

@@ -24,9 +24,12 @@ use crate::api::{
 };
 use crate::daemon::READY;
 use crate::paths::{Paths, PathsError};
+use crate::process;
 
 /// How long a daemon may take to serve after it was started.
 const START_MAX: Duration = Duration::from_secs(15);
+/// How long a daemon that owns nothing may take to end.
+const END_MAX: Duration = Duration::from_secs(5);
 /// The largest answer that is not a stream.
 const ANSWER_BYTES_MAX: usize = 64 << 20;
 /// The longest line of a stream.
@@ -242,12 +245,17 @@ impl Client {
         self.stream(Method::GET, &path, Bytes::new()).await
     }
 
-    /// Ends the daemon if it owns nothing; tells whether it does.
+    /// Ends the daemon if it owns nothing, and waits until it has ended; tells whether it owned nothing.
     ///
     /// # Errors
     /// See [`ClientError`].
     pub async fn end(&self) -> Result<bool, ClientError> {
-        self.answer(Method::POST, "/v1/end", Bytes::new()).await
+        let pidfd = process::open(self.info().await?.pid);
+        let idle = self.answer(Method::POST, "/v1/end", Bytes::new()).await?;
+        if let (true, Some(pidfd)) = (idle, pidfd) {
+            process::wait_for_end(pidfd, END_MAX).await;
+        }
+        Ok(idle)
     }
 
     async fn answer<T: DeserializeOwned>(

@@ -179,6 +179,8 @@ impl Lock {
         let path = paths.lock();
         let tries = LOCK_MAX.as_millis() / LOCK_PERIOD.as_millis();
         for _ in 0..tries {
+            // One that ends removes an empty directory.
+            paths.create()?;
             let mut options = OpenOptions::new();
             let file = options
                 .read(true)

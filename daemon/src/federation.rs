@@ -1,6 +1,6 @@
 //! The driver of one federation: moves what supervisors say into the [`Agent`] and carries out its actions.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::io;
 
 use tokio::sync::{broadcast, mpsc, watch};
@@ -70,6 +70,8 @@ pub(crate) struct Federation {
     commands: mpsc::Receiver<Command>,
     view: watch::Sender<FederationView>,
     told: broadcast::Sender<Happening>,
+    /// Members of an earlier daemon that have not said everything that happened before.
+    adopting: BTreeSet<MemberId>,
     /// Events up to here were told by an earlier daemon.
     told_until_ns: i64,
     /// When the last event was told.
@@ -140,6 +142,7 @@ impl Federation {
         for id in federation.ids() {
             let name = member_name(&federation.request, id).to_owned();
             if let Some(supervised) = federation.record.members.get(&name).cloned() {
+                federation.adopting.insert(id);
                 federation.link(
                     id,
                     &name,
@@ -178,6 +181,7 @@ impl Federation {
             commands,
             view,
             told,
+            adopting: BTreeSet::new(),
             told_until_ns: 0,
             told_last_ns: 0,
             at_ns: stamp::now_ns(),
@@ -213,6 +217,9 @@ impl Federation {
                     supervised.supervisor = Some(supervisor);
                     self.save();
                 }
+            }
+            Heard::CaughtUp { member } => {
+                self.adopting.remove(&member);
             }
             Heard::Event {
                 member,
@@ -328,6 +335,10 @@ impl Federation {
 
     /// Publishes the view, and writes the record when something other than progress changed.
     fn update(&mut self, launching: bool) {
+        if !self.adopting.is_empty() && self.agent.outcome().is_none() {
+            // Until everything is known, what the earlier daemon knew is nearer to the truth.
+            return;
+        }
         let view = FederationView {
             state: self.agent.state(),
             rti_port: self.agent.rti_port(),

@@ -15,6 +15,7 @@ mod host;
 pub mod identity;
 pub mod logs;
 pub mod paths;
+mod process;
 mod server;
 pub mod stamp;
 pub mod store;

@@ -3,17 +3,19 @@
 use std::time::{Duration, Instant};
 
 use clap::Args;
-use ictus_coord::plan::Plan;
-use ictusd::api::{Event, Happening, Outcome};
-use ictusd::client::{Client, Stream, is_already_running};
+use ictusd::api::{ErrorCode, Event, Happening, Outcome};
+use ictusd::client::{Client, ClientError, Stream, is_already_running};
 use ictusd::stamp;
+use tokio::signal::unix::{Signal, SignalKind, signal};
 
 use super::events::{describe, describe_outcome};
 use super::logs;
 use crate::args::{ManifestArgs, duration};
-use crate::error::CliError;
+use crate::error::{CliError, Kind};
 use crate::session::{Session, checked, count, request, succeed};
 use crate::ui::Ui;
+
+const GONE: &str = "the daemon went away; the federation goes on";
 
 /// How long undoing a start may take: the daemon's own bounds are shorter.
 const UNDO_MAX: Duration = Duration::from_secs(30);
@@ -37,6 +39,16 @@ pub(crate) struct Up {
     timeout: Duration,
 }
 
+/// A start that was asked for.
+#[derive(Debug)]
+struct Begun {
+    client: Client,
+    name: String,
+    stream: Stream<Happening>,
+    /// One for the whole command: a Ctrl-C between two waits counts, too.
+    interrupts: Signal,
+}
+
 /// How the wait for `healthy` ended.
 enum Start {
     Healthy,
@@ -52,68 +64,74 @@ impl Up {
         let request = request(&checked, self.trace);
         let name = checked.plan.federation.clone();
         session.block_on(async {
+            let interrupts = signal(SignalKind::interrupt()).map_err(CliError::failed)?;
             let client = session.daemon().await?;
-            let mut stream = match client.start(&name, &request).await {
+            let stream = match client.start(&name, &request).await {
                 Ok(stream) => stream,
                 Err(error) if is_already_running(&error) => {
                     ui.message(&format!("{name} is already running from the same plan"));
-                    return self.already(ui, &client, &name).await;
+                    return summary(ui, &client, &name).await;
                 }
-                Err(error) => {
-                    let hint = format!("`ictus down {name}` stops the one that runs");
-                    let conflict = error.refusal().is_some_and(is_conflict);
-                    let error = CliError::from(error);
-                    return Err(if conflict { error.hint(hint) } else { error });
-                }
+                Err(error) => return Err(refused(error, &name)),
             };
-            let begun = Instant::now();
-            match self.wait(ui, &mut stream, &checked.plan).await? {
-                Start::Healthy => {}
-                Start::Ended(outcome) => return ended_early(ui, &name, &outcome),
-                Start::Interrupted => return undo(ui, &client, &name, stream).await,
-                Start::TooLate => {
-                    undo(ui, &client, &name, stream).await.ok();
-                    let seconds = self.timeout.as_secs_f64();
-                    let message = format!("federation `{name}` was not healthy within {seconds} s");
-                    return Err(CliError::new(crate::error::Kind::Timeout, message)
-                        .hint("everything was undone; `--timeout` gives it more time"));
-                }
-            }
-            ui.stage(
-                "healthy",
-                &format!("after {:.1} s", begun.elapsed().as_secs_f64()),
-            );
-            self.summary(ui, &client, &name).await?;
-            if self.attach {
-                attach(ui, &client, &name, stream).await
-            } else {
-                Ok(())
-            }
+            let begun = Begun {
+                client,
+                name,
+                stream,
+                interrupts,
+            };
+            self.follow(ui, begun, checked.plan.federates.len()).await
         })
     }
 
-    async fn already(&self, ui: &mut Ui, client: &Client, name: &str) -> Result<(), CliError> {
-        self.summary(ui, client, name).await
+    async fn follow(&self, ui: &mut Ui, mut begun: Begun, of: usize) -> Result<(), CliError> {
+        let since = Instant::now();
+        match begun.wait(ui, self.timeout, of).await? {
+            Start::Healthy => {}
+            Start::Ended(outcome) => {
+                ui.stage("ended", &describe_outcome(&outcome));
+                return succeed(&begun.name, &outcome);
+            }
+            Start::Interrupted => {
+                let message = format!("federation `{}` was not started", begun.name);
+                begun.undo(ui).await?;
+                return Err(CliError::failed(message));
+            }
+            Start::TooLate => {
+                let (name, seconds) = (begun.name.clone(), self.timeout.as_secs_f64());
+                begun.undo(ui).await?;
+                let message = format!("federation `{name}` was not healthy within {seconds} s");
+                return Err(CliError::new(Kind::Timeout, message)
+                    .hint("everything was undone; `--timeout` gives it more time"));
+            }
+        }
+        ui.stage(
+            "healthy",
+            &format!("after {:.1} s", since.elapsed().as_secs_f64()),
+        );
+        summary(ui, &begun.client, &begun.name).await?;
+        if self.attach {
+            begun.attach(ui).await
+        } else {
+            Ok(())
+        }
     }
+}
 
+impl Begun {
     /// Reports stages until it is healthy, or will not be.
-    async fn wait(
-        &self,
-        ui: &mut Ui,
-        stream: &mut Stream<Happening>,
-        plan: &Plan,
-    ) -> Result<Start, CliError> {
+    async fn wait(&mut self, ui: &mut Ui, limit: Duration, of: usize) -> Result<Start, CliError> {
         let mut stages = Stages {
             all_started: false,
             joined: 0,
-            of: plan.federates.len(),
+            of,
         };
-        let deadline = tokio::time::sleep(self.timeout);
+        let deadline = tokio::time::sleep(limit);
         tokio::pin!(deadline);
         loop {
             let happening = tokio::select! {
-                next = stream.next() => next?,
-                _ = tokio::signal::ctrl_c() => return Ok(Start::Interrupted),
+                next = self.stream.next() => next?,
+                _ = self.interrupts.recv() => return Ok(Start::Interrupted),
                 () = &mut deadline => return Ok(Start::TooLate),
             };
             let Some(Happening { event, .. }) = happening else {
@@ -131,22 +149,85 @@ impl Up {
         }
     }
 
-    async fn summary(&self, ui: &mut Ui, client: &Client, name: &str) -> Result<(), CliError> {
-        let view = client.federation(name).await?;
-        ui.result(&view, || {
-            let federates = count(view.federates.len(), "federate");
-            let port = view.rti_port.map(|port| format!(", RTI on 127.0.0.1:{port}"));
-            format!(
-                "{name} runs: {federates}{}\n  ictus ps\n  ictus logs -f {name}\n  ictus timing {name}\n  \
-                 ictus down {name}",
-                port.unwrap_or_default()
-            )
-        })
+    /// Has the daemon undo the start and waits for it; a second Ctrl-C does not wait.
+    async fn undo(mut self, ui: &mut Ui) -> Result<(), CliError> {
+        ui.stage("undoing", &self.name);
+        self.client.stop(&self.name, false).await?;
+        let stream = &mut self.stream;
+        let ended = async {
+            while let Some(happening) = stream.next().await? {
+                if matches!(happening.event, Event::Ended { .. }) {
+                    break;
+                }
+            }
+            Ok::<(), CliError>(())
+        };
+        tokio::select! {
+            ended = tokio::time::timeout(UNDO_MAX, ended) => {
+                if let Ok(ended) = ended {
+                    ended?;
+                    ui.stage("undone", "nothing runs");
+                }
+            }
+            _ = self.interrupts.recv() => {}
+        }
+        Ok(())
+    }
+
+    /// Shows logs until the federation ends; the first Ctrl-C stops it, the second kills it.
+    async fn attach(mut self, ui: &mut Ui) -> Result<(), CliError> {
+        let lines = self.client.logs(&self.name, &[], true, None).await?;
+        let (mut interrupts, mut printed, mut outcome) = (0, false, None);
+        let printing = logs::print(ui, lines);
+        tokio::pin!(printing);
+        while outcome.is_none() || !printed {
+            tokio::select! {
+                result = &mut printing, if !printed => {
+                    result?;
+                    printed = true;
+                }
+                happening = self.stream.next(), if outcome.is_none() => match happening? {
+                    Some(Happening { event: Event::Ended { outcome: how }, .. }) => {
+                        outcome = Some(how);
+                    }
+                    Some(_) => {}
+                    None => return Err(CliError::failed(GONE)),
+                },
+                _ = self.interrupts.recv() => {
+                    interrupts += 1;
+                    // Its stream is not needed: the end is seen above.
+                    self.client.stop(&self.name, interrupts > 1).await?;
+                }
+            }
+        }
+        succeed(&self.name, &outcome.unwrap_or(Outcome::Completed))
     }
 }
 
-fn is_conflict(refusal: &ictusd::api::ApiError) -> bool {
-    refusal.code == ictusd::api::ErrorCode::Conflict
+async fn summary(ui: &mut Ui, client: &Client, name: &str) -> Result<(), CliError> {
+    let view = client.federation(name).await?;
+    ui.result(&view, || {
+        let federates = count(view.federates.len(), "federate");
+        let port = view
+            .rti_port
+            .map(|port| format!(", RTI on 127.0.0.1:{port}"));
+        let port = port.unwrap_or_default();
+        format!(
+            "{name} runs: {federates}{port}\n  ictus ps\n  ictus logs -f {name}\n  \
+             ictus timing {name}\n  ictus down {name}"
+        )
+    })
+}
+
+fn refused(error: ClientError, name: &str) -> CliError {
+    let conflict = error
+        .refusal()
+        .is_some_and(|refusal| refusal.code == ErrorCode::Conflict);
+    let error = CliError::from(error);
+    if conflict {
+        return error.hint(format!("`ictus down {name}` stops the one that runs"));
+    }
+    error
 }
 
 /// What has been reported.
@@ -215,74 +296,4 @@ fn counted(ui: &mut Ui, stage: &str, reached: usize, of: usize) {
 
 fn start_tag(start_ns: i64) -> String {
     format!("on the start tag {}", stamp::text(start_ns))
-}
-
-fn ended_early(ui: &mut Ui, name: &str, outcome: &Outcome) -> Result<(), CliError> {
-    ui.stage("ended", &describe_outcome(outcome));
-    succeed(name, outcome)
-}
-
-/// Ctrl-C or too late: has the daemon undo the start and waits for it, in vain after a second Ctrl-C.
-async fn undo(
-    ui: &mut Ui,
-    client: &Client,
-    name: &str,
-    mut stream: Stream<Happening>,
-) -> Result<(), CliError> {
-    ui.stage("undoing", name);
-    let ended = async {
-        client.stop(name, false).await?;
-        while let Some(happening) = stream.next().await? {
-            if matches!(happening.event, Event::Ended { .. }) {
-                break;
-            }
-        }
-        Ok::<(), CliError>(())
-    };
-    tokio::select! {
-        ended = tokio::time::timeout(UNDO_MAX, ended) => {
-            if let Ok(ended) = ended {
-                ended?;
-                ui.stage("undone", "nothing runs");
-            }
-        }
-        _ = tokio::signal::ctrl_c() => {}
-    }
-    Err(CliError::failed(format!(
-        "federation `{name}` was not started"
-    )))
-}
-
-/// Shows logs until the federation ends; the first Ctrl-C stops it, the second kills it.
-async fn attach(
-    ui: &mut Ui,
-    client: &Client,
-    name: &str,
-    mut stream: Stream<Happening>,
-) -> Result<(), CliError> {
-    let lines = client.logs(name, &[], true, None).await?;
-    let mut interrupts = 0;
-    let (mut printed, mut outcome) = (false, None);
-    let printing = logs::print(ui, lines);
-    tokio::pin!(printing);
-    while outcome.is_none() || !printed {
-        tokio::select! {
-            result = &mut printing, if !printed => {
-                result?;
-                printed = true;
-            }
-            happening = stream.next(), if outcome.is_none() => match happening? {
-                Some(Happening { event: Event::Ended { outcome: how }, .. }) => outcome = Some(how),
-                Some(_) => {}
-                None => return Err(CliError::failed("the daemon went away; the federation goes on")),
-            },
-            _ = tokio::signal::ctrl_c() => {
-                interrupts += 1;
-                // Its stream is not needed: the end is seen above.
-                client.stop(name, interrupts > 1).await?;
-            }
-        }
-    }
-    let outcome = outcome.unwrap_or(Outcome::Completed);
-    succeed(name, &outcome)
 }

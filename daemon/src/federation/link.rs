@@ -1,14 +1,11 @@
 //! The connection to one supervisor: starts it or finds it again, and passes words and signals.
 
 use std::io;
-use std::os::fd::OwnedFd;
 use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
 use std::process::Stdio;
 use std::time::Duration;
 
-use rustix::event::{PollFd, PollFlags, Timespec, poll};
-use rustix::process::{Pid, PidfdFlags, pidfd_open};
 use tokio::io::{AsyncBufReadExt, AsyncReadExt, AsyncWriteExt, BufReader, Lines};
 use tokio::net::UnixStream;
 use tokio::net::unix::{OwnedReadHalf, OwnedWriteHalf};
@@ -18,12 +15,12 @@ use tokio::time::timeout;
 use super::launch;
 use crate::agent::{MemberEvent, MemberId};
 use crate::identity::ProcessIdentity;
-use crate::stamp;
 use crate::store::Supervised;
 use crate::supervisor::READY;
 use crate::supervisor::exit::ExitRecord;
 use crate::supervisor::protocol::{Reply, Request, StopSignal};
 use crate::supervisor::spec::{PROTOCOL, Spec};
+use crate::{process, stamp};
 
 /// How long a supervisor may take to listen, to answer, and to end after its release.
 const ANSWER_MAX: Duration = Duration::from_secs(10);
@@ -59,6 +56,8 @@ pub(crate) enum Heard {
         member: MemberId,
         supervisor: ProcessIdentity,
     },
+    /// Everything that happened before was said.
+    CaughtUp { member: MemberId },
     /// It said something.
     Event {
         member: MemberId,
@@ -104,6 +103,7 @@ impl Link {
             Err(Failed::Foreign(why)) => self.say(MemberEvent::Foreign { why }).await,
             Err(Failed::Nobody) => self.say_from_record().await,
         }
+        self.caught_up().await;
     }
 
     async fn launch(&self, spec: &Spec) -> Result<Connection, Failed> {
@@ -187,9 +187,12 @@ impl Link {
         if peer != Some((own, Some(supervisor.pid))) {
             return foreign("its supervisor is another process than it says");
         }
-        send(&mut writer, Request::Subscribe)
-            .await
-            .map_err(|_| Failed::Nobody)?;
+        // The status is asked for because its answer comes after everything that happened before.
+        for request in [Request::Subscribe, Request::Status] {
+            send(&mut writer, request)
+                .await
+                .map_err(|_| Failed::Nobody)?;
+        }
         Ok(Connection {
             lines,
             writer,
@@ -198,7 +201,7 @@ impl Link {
     }
 
     async fn follow(&mut self, mut connection: Connection) {
-        let pidfd = open_pidfd(connection.supervisor.pid);
+        let pidfd = process::open(connection.supervisor.pid);
         loop {
             tokio::select! {
                 line = connection.lines.next_line() => {
@@ -206,7 +209,7 @@ impl Link {
                     if self.pass(&line).await {
                         send(&mut connection.writer, Request::Release).await.ok();
                         if let Some(pidfd) = pidfd {
-                            wait_for_end(pidfd).await;
+                            process::wait_for_end(pidfd, ANSWER_MAX).await;
                         }
                         return self.say(MemberEvent::Closed).await;
                     }
@@ -230,7 +233,11 @@ impl Link {
                 tracing::debug!(member = ?self.member, why, "refused");
                 return false;
             }
-            Ok(Reply::Identity { .. } | Reply::Status { .. } | Reply::Done) | Err(_) => {
+            Ok(Reply::Status { .. }) => {
+                self.caught_up().await;
+                return false;
+            }
+            Ok(Reply::Identity { .. } | Reply::Done) | Err(_) => {
                 return false;
             }
         };
@@ -262,6 +269,11 @@ impl Link {
         self.say(MemberEvent::Closed).await;
     }
 
+    async fn caught_up(&self) {
+        let member = self.member;
+        self.hear.send(Heard::CaughtUp { member }).await.ok();
+    }
+
     async fn say(&self, event: MemberEvent) {
         let heard = Heard::Event {
             member: self.member,
@@ -290,22 +302,6 @@ async fn first_line(out: Option<tokio::process::ChildStdout>) -> io::Result<Stri
             .await?;
     }
     Ok(line)
-}
-
-fn open_pidfd(pid: u32) -> Option<OwnedFd> {
-    let pid = Pid::from_raw(i32::try_from(pid).ok()?)?;
-    pidfd_open(pid, PidfdFlags::empty()).ok()
-}
-
-/// Waits until the process has ended; at most [`ANSWER_MAX`].
-async fn wait_for_end(pidfd: OwnedFd) {
-    let wait = move || {
-        let bound = Timespec::try_from(ANSWER_MAX).ok();
-        poll(&mut [PollFd::new(&pidfd, PollFlags::IN)], bound.as_ref())
-    };
-    if let Ok(Err(error)) = tokio::task::spawn_blocking(wait).await {
-        tracing::warn!(%error, "cannot wait for a supervisor");
-    }
 }
 
 async fn send(writer: &mut OwnedWriteHalf, request: Request) -> io::Result<()> {

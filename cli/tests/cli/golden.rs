@@ -1,0 +1,130 @@
+//! Help and errors, word for word: `tests/golden/NAME.txt`. `UPDATE_GOLDEN=1` writes what is said now.
+
+use std::fs;
+use std::path::Path;
+
+use crate::environment::Environment;
+
+#[track_caller]
+fn check(name: &str, environment: &Environment, args: &[&str]) {
+    let said = environment.run(args);
+    let found = format!("$ ictus {}\n{said}", args.join(" "));
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join(format!("tests/golden/{name}.txt"));
+    if std::env::var_os("UPDATE_GOLDEN").is_some() {
+        fs::write(&path, &found).unwrap();
+    }
+    let expected = fs::read_to_string(&path).unwrap_or_default();
+    assert_eq!(
+        found,
+        expected,
+        "{} differs; UPDATE_GOLDEN=1 rewrites it",
+        path.display()
+    );
+}
+
+#[test]
+fn help() {
+    let environment = Environment::new();
+    check("help", &environment, &["-h"]);
+    check("help_up", &environment, &["help", "up"]);
+    check("help_down", &environment, &["down", "-h"]);
+    check("help_logs", &environment, &["logs", "-h"]);
+    check("help_timing", &environment, &["timing", "-h"]);
+    check("help_verify", &environment, &["verify", "-h"]);
+}
+
+#[test]
+fn wrong_command_lines_exit_with_64() {
+    let environment = Environment::new();
+    check("no_command", &environment, &[]);
+    check("unknown_command", &environment, &["upp"]);
+    check("unknown_option", &environment, &["up", "--attached"]);
+    check("bad_timeout", &environment, &["up", "--timeout", "soon"]);
+    check("bad_set", &environment, &["up", "--set", "half"]);
+}
+
+#[test]
+fn there_is_nothing() {
+    let environment = Environment::new();
+    check("no_manifest", &environment, &["check"]);
+    check("nothing_runs", &environment, &["ps"]);
+    check("nothing_to_take_down", &environment, &["down"]);
+    check("nothing_of_that_name", &environment, &["logs", "diamond"]);
+    check("no_such_code", &environment, &["explain", "F999"]);
+    assert!(
+        !environment.state().exists(),
+        "asking leaves nothing behind"
+    );
+}
+
+#[test]
+fn mistakes_of_a_manifest() {
+    let environment = Environment::new();
+    let text = "ictus: v1\nfederation: bad\nfederates:\n  a: { clas: A }\nconections: []\n";
+    environment.write("bad.yaml", text);
+    check(
+        "bad_manifest",
+        &environment,
+        &["check", "--no-build", "bad.yaml"],
+    );
+    check(
+        "bad_manifest_json",
+        &environment,
+        &["check", "--no-build", "bad.yaml", "-o", "json"],
+    );
+    let text = "ictus: v1\nfederation: x\nprograms: { p: { binary: FIXTURE_PROGRAM } }\n\
+                federates: { a: { class: Source } }\n";
+    environment.write("endless.yaml", text);
+    check(
+        "verify_needs_a_timeout",
+        &environment,
+        &["verify", "-q", "endless.yaml"],
+    );
+}
+
+#[test]
+fn a_run_directory_that_is_too_deep() {
+    let environment = Environment::new();
+    let deep = environment.path(&"d".repeat(120));
+    let said = environment
+        .command(&["ps"])
+        .env("ICTUS_STATE_DIR", &deep)
+        .output()
+        .unwrap();
+    assert_eq!(said.status.code(), Some(1));
+    let said = String::from_utf8(said.stderr).unwrap();
+    assert!(
+        said.contains("too long for sockets") && said.contains("\nhint: "),
+        "{said}"
+    );
+}
+
+#[test]
+fn results_go_to_standard_output_and_a_closed_one_is_no_error() {
+    let environment = Environment::new();
+    let said = environment.run(&["schema"]).ok();
+    let schema: serde_json::Value = serde_json::from_str(&said.out).unwrap();
+    assert!(schema.is_object());
+    assert_eq!(said.err, "");
+    let mut command = environment.command(&["schema"]);
+    let mut child = command
+        .stdout(std::process::Stdio::piped())
+        .spawn()
+        .unwrap();
+    drop(child.stdout.take());
+    assert!(child.wait().unwrap().success());
+}
+
+#[test]
+fn the_rti_goes_by_its_own_name_too() {
+    let environment = Environment::new();
+    let link = environment.path("ictus-rti");
+    std::os::unix::fs::symlink(env!("CARGO_BIN_EXE_ictus"), &link).unwrap();
+    let said = std::process::Command::new(&link)
+        .arg("--help")
+        .output()
+        .unwrap();
+    let own = environment.run(&["rti", "--help"]).ok();
+    assert_eq!(String::from_utf8(said.stdout).unwrap(), own.out);
+    assert!(own.out.contains("--number_of_federates"), "{own}");
+}
