@@ -185,7 +185,9 @@ fn failed(name: &str, failure: &Failure, was_healthy: bool) -> CliError {
         "; everything was undone"
     };
     let mut message = format!("{who}: {}{when}", failure.what);
-    for line in &failure.lines {
+    // Of a run that had been healthy the first words are not the last ones.
+    let lines = if was_healthy { &[][..] } else { &failure.lines };
+    for line in lines {
         message.push_str(&format!("\n  | {line}"));
     }
     let kind = match failure.kind {

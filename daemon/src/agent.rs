@@ -24,6 +24,8 @@ use member::{Member, Process};
 pub const RTI: &str = "rti";
 /// How long after the last join the start may take: start consensus and the first tag.
 const FIRST_TAG_MAX: Duration = Duration::from_secs(60);
+/// Refused connections that are told: who floods the RTI's port must not flood who watches.
+const REJECTED_MAX: u32 = 20;
 /// How long after SIGTERM SIGKILL follows, and after SIGKILL the end is declared.
 const KILL_GRACE: Duration = Duration::from_secs(2);
 
@@ -110,6 +112,8 @@ pub struct Agent {
     was_healthy: bool,
     /// The RTI has lost a federate, so its own exit code is only a consequence.
     lost_one: bool,
+    /// Connections that the RTI refused.
+    rejected: u32,
     failures: Vec<Ranked>,
     actions: VecDeque<Action>,
 }
@@ -202,6 +206,7 @@ impl Agent {
             start_ns: None,
             was_healthy: false,
             lost_one: false,
+            rejected: 0,
             failures: Vec::new(),
             actions: VecDeque::new(),
         }

@@ -28,6 +28,8 @@ use crate::process;
 
 /// How long a daemon may take to serve after it was started.
 const START_MAX: Duration = Duration::from_secs(15);
+/// How long a daemon may take to begin an answer, a removal apart.
+const ANSWER_MAX: Duration = Duration::from_secs(10);
 /// How long a daemon that owns nothing may take to end.
 const END_MAX: Duration = Duration::from_secs(5);
 /// The largest answer that is not a stream.
@@ -63,6 +65,9 @@ pub enum ClientError {
         /// Why.
         source: io::Error,
     },
+    /// The daemon does not answer; it may be stopped or overloaded.
+    #[error("the daemon does not answer")]
+    Silent,
     /// The connection broke.
     #[error("the connection to the daemon broke")]
     Broken(#[source] hyper::Error),
@@ -86,6 +91,7 @@ impl ClientError {
             Self::Paths(_)
             | Self::NotStarted { .. }
             | Self::Unreachable { .. }
+            | Self::Silent
             | Self::Broken(_)
             | Self::NotUnderstood(_)
             | Self::TooLarge => None,
@@ -96,10 +102,14 @@ impl ClientError {
 impl Client {
     /// Finds the daemon that serves; absent when there is none.
     pub async fn find(paths: &Paths) -> Option<Self> {
-        let client = Self {
-            socket: paths.socket(),
-        };
-        client.info().await.is_ok().then_some(client)
+        // A session with another XDG_RUNTIME_DIR may have started it: the lock tells where it listens.
+        for socket in paths.socket_in_lock().into_iter().chain([paths.socket()]) {
+            let client = Self { socket };
+            if client.info().await.is_ok() {
+                return Some(client);
+            }
+        }
+        None
     }
 
     /// Finds the daemon, or starts `EXECUTABLE daemon` and waits until it serves.
@@ -140,9 +150,8 @@ impl Client {
                 .unwrap_or_default();
             return Err(failed(String::from_utf8_lossy(new).trim().to_owned()));
         }
-        Ok(Self {
-            socket: paths.socket(),
-        })
+        let found = Self::find(paths).await;
+        found.ok_or_else(|| failed("it serves, but does not answer".to_owned()))
     }
 
     /// Asks who answers.
@@ -310,10 +319,17 @@ impl Client {
             .header("host", "ictusd")
             .body(Full::new(body))
             .map_err(|error| unreachable(io::Error::other(error)))?;
-        let response = sender
-            .send_request(request)
-            .await
-            .map_err(ClientError::Broken)?;
+        let removal = request.method() == Method::DELETE;
+        let answer = sender.send_request(request);
+        let response = if removal {
+            // As long as the federation takes to stop, which has bounds of its own.
+            answer.await
+        } else {
+            timeout(ANSWER_MAX, answer)
+                .await
+                .map_err(|_| ClientError::Silent)?
+        };
+        let response = response.map_err(ClientError::Broken)?;
         if response.status() == StatusCode::OK {
             return Ok((response, connection));
         }

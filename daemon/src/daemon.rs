@@ -2,6 +2,7 @@
 
 use std::fs::{File, OpenOptions};
 use std::io::{self, Write};
+use std::os::unix::ffi::OsStrExt;
 use std::os::unix::fs::MetadataExt;
 use std::os::unix::net::UnixStream;
 use std::path::{Path, PathBuf};
@@ -190,13 +191,21 @@ impl Lock {
                 .open(&path);
             let file = file.map_err(system("open the lock"))?;
             match flock(&file, FlockOperation::NonBlockingLockExclusive) {
-                Ok(()) if is_at(&file, &path) => return Ok(Some(Self { file, path })),
+                Ok(()) if is_at(&file, &path) => {
+                    let socket = paths.socket();
+                    file.set_len(0).map_err(system("write the lock"))?;
+                    (&file)
+                        .write_all(socket.as_os_str().as_bytes())
+                        .map_err(system("write the lock"))?;
+                    return Ok(Some(Self { file, path }));
+                }
                 // Removed by who held it; there may be another by now.
                 Ok(()) => continue,
                 Err(rustix::io::Errno::WOULDBLOCK) => {}
                 Err(error) => return Err(system("lock")(error.into())),
             }
-            if UnixStream::connect(paths.socket()).is_ok() {
+            let serves = |socket: PathBuf| UnixStream::connect(socket).is_ok();
+            if paths.socket_in_lock().is_some_and(serves) {
                 return Ok(None);
             }
             std::thread::sleep(LOCK_PERIOD);

@@ -143,12 +143,8 @@ impl Federation {
             let name = member_name(&federation.request, id).to_owned();
             if let Some(supervised) = federation.record.members.get(&name).cloned() {
                 federation.adopting.insert(id);
-                federation.link(
-                    id,
-                    &name,
-                    supervised.instance.clone(),
-                    Origin::Adopt(supervised),
-                );
+                let origin = Origin::Adopt(supervised.supervisor);
+                federation.link(id, &name, &supervised, origin);
             }
         }
         Ok((federation, handle))
@@ -254,44 +250,43 @@ impl Federation {
         }
         let mut ready = Vec::new();
         for (member, rti_port) in launches {
-            let name = member_name(&self.request, member).to_owned();
             match random_id() {
-                Ok(instance) => ready.push((member, name, instance, rti_port)),
+                Ok(instance) => {
+                    let socket = self.paths.supervisor_socket(&instance);
+                    let supervised = Supervised {
+                        instance,
+                        socket,
+                        supervisor: None,
+                    };
+                    let name = member_name(&self.request, member).to_owned();
+                    self.record.members.insert(name.clone(), supervised.clone());
+                    ready.push((member, name, rti_port, supervised));
+                }
                 Err(error) => tracing::error!(%error, "no random id"),
             }
         }
-        for (_, name, instance, _) in &ready {
-            let supervised = Supervised {
-                instance: instance.clone(),
-                supervisor: None,
-            };
-            self.record.members.insert(name.clone(), supervised);
-        }
         self.update(!ready.is_empty());
-        for (member, name, instance, rti_port) in ready {
+        for (member, name, rti_port, supervised) in ready {
             let spec = launch::spec(
-                &launch::Place {
-                    paths: &self.paths,
-                    directory: &self.directory,
-                },
+                &self.directory,
                 &self.request,
                 &self.record.view.id,
                 (member, rti_port),
-                instance.clone(),
+                &supervised,
             );
-            self.link(member, &name, instance, Origin::Launch(Box::new(spec)));
+            self.link(member, &name, &supervised, Origin::Launch(Box::new(spec)));
         }
     }
 
-    fn link(&mut self, member: MemberId, name: &str, instance: String, origin: Origin) {
+    fn link(&mut self, member: MemberId, name: &str, supervised: &Supervised, origin: Origin) {
         let (signal, signals) = mpsc::channel(SIGNALS_MAX);
         self.links.insert(member, signal);
         let link = Link {
             member,
-            socket: self.paths.supervisor_socket(&instance),
+            socket: supervised.socket.clone(),
             spec: self.directory.spec(name),
             exit_record: self.directory.exit_record(name),
-            instance,
+            instance: supervised.instance.clone(),
             hear: self.hear.clone(),
             signals,
         };

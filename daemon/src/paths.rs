@@ -3,7 +3,7 @@
 use std::ffi::OsString;
 use std::fs::{self, DirBuilder, Permissions};
 use std::io;
-use std::os::unix::ffi::OsStrExt;
+use std::os::unix::ffi::{OsStrExt, OsStringExt};
 use std::os::unix::fs::{DirBuilderExt, MetadataExt, PermissionsExt};
 use std::path::{Path, PathBuf};
 
@@ -17,7 +17,7 @@ const SOCKET_NAME_BYTES_MAX: usize = 38;
 pub struct Paths {
     /// Records and logs; survives reboots.
     pub state: PathBuf,
-    /// Sockets and the lock; private (mode 0700).
+    /// Sockets; private (mode 0700).
     pub run: PathBuf,
 }
 
@@ -147,10 +147,18 @@ impl Paths {
         self.run.join("ictusd.sock")
     }
 
-    /// The daemon's lock: who holds it is the daemon.
+    /// The daemon's lock: who holds it is the daemon of this state directory, and has written its socket's path
+    /// there. Sessions may differ in `XDG_RUNTIME_DIR`, so the run directory would not do.
     #[must_use]
     pub fn lock(&self) -> PathBuf {
-        self.run.join("ictusd.lock")
+        self.state.join("ictusd.lock")
+    }
+
+    /// The socket of the daemon that holds the lock, wherever it is.
+    #[must_use]
+    pub fn socket_in_lock(&self) -> Option<PathBuf> {
+        let path = fs::read(self.lock()).ok()?;
+        (!path.is_empty()).then(|| PathBuf::from(OsString::from_vec(path)))
     }
 
     /// The socket of the supervisor with this instance id.

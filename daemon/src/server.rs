@@ -8,7 +8,7 @@ use std::time::Duration;
 
 use axum::Router;
 use axum::body::{Body, Bytes};
-use axum::extract::{Path, Query, Request, State};
+use axum::extract::{DefaultBodyLimit, Path, Query, Request, State};
 use axum::http::StatusCode;
 use axum::http::header::CONTENT_TYPE;
 use axum::middleware::{Next, from_fn_with_state};
@@ -29,6 +29,8 @@ use crate::logs::Follower;
 
 /// Lines of a stream that wait for a slow client.
 const LINES_MAX: usize = 1024;
+/// The largest request: a plan of thousands of federates.
+const REQUEST_BYTES_MAX: usize = 64 << 20;
 /// How often growing log files are looked at.
 const FOLLOW_PERIOD: Duration = Duration::from_millis(100);
 /// How long to wait before another connection is tried when the system is out of descriptors.
@@ -50,6 +52,7 @@ pub(crate) fn router(host: Host) -> Router {
         .route("/v1/end", post(end))
         .fallback(async || bad_request("no such call; is the daemon of another version?"))
         .layer(from_fn_with_state(host.clone(), touch))
+        .layer(DefaultBodyLimit::max(REQUEST_BYTES_MAX))
         .with_state(host)
 }
 

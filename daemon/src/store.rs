@@ -38,6 +38,8 @@ pub struct Record {
 pub struct Supervised {
     /// The random id it answers with.
     pub instance: String,
+    /// Where it listens.
+    pub socket: PathBuf,
     /// The process, once it has answered.
     pub supervisor: Option<ProcessIdentity>,
 }

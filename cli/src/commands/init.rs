@@ -12,8 +12,8 @@ use crate::ui::Ui;
 /// The crate that programs link, in the source tree that this executable was built from.
 const DRIVER: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../runtime/driver");
 
-const MANIFEST: &str = include_str!("init/federation.yaml");
-const PROGRAM: &str = include_str!("init/main.rs.txt");
+const MANIFEST: &str = include_str!("../../templates/federation.yaml");
+const PROGRAM: &str = include_str!("../../templates/main.rs");
 
 /// Write a small federation to start from: a manifest and a cargo package with two reactor classes
 #[derive(Debug, Args)]

@@ -70,6 +70,9 @@ impl Up {
                 Ok(stream) => stream,
                 Err(error) if is_already_running(&error) => {
                     ui.message(&format!("{name} is already running from the same plan"));
+                    if self.attach {
+                        ui.message("not attached: who started it may be");
+                    }
                     return summary(ui, &client, &name).await;
                 }
                 Err(error) => return Err(refused(error, &name)),

@@ -83,6 +83,14 @@ fn mistakes_of_a_manifest() {
 }
 
 #[test]
+fn init_writes_what_check_accepts_and_overwrites_nothing() {
+    let environment = Environment::new();
+    check("init", &environment, &["init", "robot"]);
+    environment.run(&["check", "--no-build", "robot"]).ok();
+    check("init_again", &environment, &["init", "robot"]);
+}
+
+#[test]
 fn a_run_directory_that_is_too_deep() {
     let environment = Environment::new();
     let deep = environment.path(&"d".repeat(120));

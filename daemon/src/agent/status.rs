@@ -2,7 +2,7 @@
 
 use ictus_coord::report::{FederateStatus, RtiStatus};
 
-use super::{Agent, FIRST_TAG_MAX, MemberId, Now, Phase, RTI, Why};
+use super::{Agent, FIRST_TAG_MAX, MemberId, Now, Phase, REJECTED_MAX, RTI, Why};
 use crate::api::Event;
 
 impl Agent {
@@ -82,7 +82,12 @@ impl Agent {
                     self.fail(now, 1, failure);
                 }
             }
-            RtiStatus::Rejected { peer, reason } => self.tell(Event::Rejected { peer, reason }),
+            RtiStatus::Rejected { peer, reason } => {
+                self.rejected += 1;
+                if self.rejected <= REJECTED_MAX {
+                    self.tell(Event::Rejected { peer, reason });
+                }
+            }
             RtiStatus::Ended { .. } => {}
         }
     }

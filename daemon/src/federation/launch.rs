@@ -8,8 +8,7 @@ use ictus_deploy::{FederateKind, FederateRun};
 
 use crate::agent::{MemberId, RTI};
 use crate::api::StartRequest;
-use crate::paths::Paths;
-use crate::store::Directory;
+use crate::store::{Directory, Supervised};
 use crate::supervisor::log_path;
 use crate::supervisor::process::own_executable;
 use crate::supervisor::spec::{PROTOCOL, Spec};
@@ -19,21 +18,14 @@ const LINGER_MS: u32 = 5_000;
 /// Variables of the daemon that federates see, too.
 const PASSED_ON: [&str; 4] = ["HOME", "LANG", "PATH", "TZ"];
 
-/// Where a federation's files are.
-pub(crate) struct Place<'a> {
-    pub(crate) paths: &'a Paths,
-    pub(crate) directory: &'a Directory,
-}
-
 /// What a member's supervisor is to run.
 pub(crate) fn spec(
-    place: &Place<'_>,
+    directory: &Directory,
     request: &StartRequest,
     federation_id: &str,
     (member, rti_port): (MemberId, Option<u16>),
-    instance: String,
+    supervised: &Supervised,
 ) -> Spec {
-    let directory = place.directory;
     let run = match member {
         MemberId::Rti => None,
         MemberId::Federate(index) => Some(&request.federates[usize::from(index)]),
@@ -60,10 +52,10 @@ pub(crate) fn spec(
         log: log_path(&directory.logs(), &name),
         log_size_max: request.settings.log_max_size,
         log_files_max: request.settings.log_max_files.max(1),
-        socket: place.paths.supervisor_socket(&instance),
+        socket: supervised.socket.clone(),
         exit_record: directory.exit_record(&name),
         linger_ms: LINGER_MS,
-        instance,
+        instance: supervised.instance.clone(),
         name,
     }
 }

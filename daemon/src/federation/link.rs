@@ -15,7 +15,6 @@ use tokio::time::timeout;
 use super::launch;
 use crate::agent::{MemberEvent, MemberId};
 use crate::identity::ProcessIdentity;
-use crate::store::Supervised;
 use crate::supervisor::READY;
 use crate::supervisor::exit::ExitRecord;
 use crate::supervisor::protocol::{Reply, Request, StopSignal};
@@ -45,7 +44,7 @@ pub(crate) enum Origin {
     /// It is to be started.
     Launch(Box<Spec>),
     /// It was started by another daemon.
-    Adopt(Supervised),
+    Adopt(Option<ProcessIdentity>),
 }
 
 /// What a link says to the driver.
@@ -87,7 +86,7 @@ impl Link {
     pub(crate) async fn run(mut self, origin: Origin) {
         let connected = match origin {
             Origin::Launch(spec) => self.launch(&spec).await,
-            Origin::Adopt(supervised) => self.adopt(&supervised).await,
+            Origin::Adopt(recorded) => self.adopt(recorded).await,
         };
         match connected {
             Ok(connection) => {
@@ -135,8 +134,8 @@ impl Link {
         })
     }
 
-    async fn adopt(&self, supervised: &Supervised) -> Result<Connection, Failed> {
-        let connection = self.connect(supervised.supervisor).await;
+    async fn adopt(&self, recorded: Option<ProcessIdentity>) -> Result<Connection, Failed> {
+        let connection = self.connect(recorded).await;
         if matches!(connection, Err(Failed::Nobody)) {
             // Killed: it could not remove its socket. The name is random, so it is ours.
             std::fs::remove_file(&self.socket).ok();

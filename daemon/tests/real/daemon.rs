@@ -391,6 +391,30 @@ async fn a_stale_socket_is_replaced_and_two_daemons_never_serve() {
 }
 
 #[tokio::test]
+async fn a_session_with_another_runtime_directory_finds_the_same_daemon_and_federates() {
+    let mut world = World::new().await;
+    let pair = world
+        .start_healthy("pair", &federation(&[("a", ""), ("b", "")]))
+        .await;
+    let elsewhere = tempfile::tempdir().unwrap();
+    let other = ictusd::paths::Paths {
+        run: elsewhere.path().join("ictus"),
+        ..world.paths.clone()
+    };
+    let client = Client::find(&other).await.unwrap();
+    assert_eq!(client.info().await.unwrap().pid, world.daemon.id());
+    world.kill_daemon();
+    world.paths = other;
+    world.replace_daemon_after_end().await;
+    let mut stop = world.client.stop("pair", false).await.unwrap();
+    assert_eq!(
+        outcome(&mut stop).await,
+        Outcome::Stopped { missed: Vec::new() }
+    );
+    pair.processes["a"].assert_ends();
+}
+
+#[tokio::test]
 async fn a_daemon_that_owns_nothing_ends_and_leaves_nothing() {
     let directory = tempfile::tempdir().unwrap();
     let state = directory.path().join("s");

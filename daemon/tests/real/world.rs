@@ -76,7 +76,7 @@ pub(crate) struct World {
 impl World {
     pub(crate) async fn new() -> Self {
         let directory = tempfile::tempdir().unwrap();
-        let state = directory.path().join("s");
+        let state = directory.path().join("ictus");
         let paths = Paths {
             run: state.join("run"),
             state,
@@ -172,6 +172,12 @@ pub(crate) fn spawn_daemon(paths: &Paths, idle_ms: &str) -> Child {
         .env_clear()
         .env("ICTUS_STATE_DIR", &paths.state);
     command.env(ictusd::daemon::IDLE_VARIABLE, idle_ms);
+    if paths.run != paths.state.join("run") {
+        // As a login session would: STATE is below its parent, RUN too.
+        command.env_remove("ICTUS_STATE_DIR");
+        command.env("XDG_STATE_HOME", paths.state.parent().unwrap());
+        command.env("XDG_RUNTIME_DIR", paths.run.parent().unwrap());
+    }
     let mut child = command
         .stdin(Stdio::null())
         .stdout(Stdio::piped())
