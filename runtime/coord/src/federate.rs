@@ -305,11 +305,18 @@ impl Federate {
                 self.batch.clear();
                 match self.timeline.ready(&mut self.batch) {
                     Progress::Batch => return Poll::Run,
-                    Progress::InFlight => return Poll::Wait(None),
+                    Progress::InFlight => {
+                        self.send_absents();
+                        return Poll::Wait(None);
+                    }
                     Progress::Blocked if self.stop.gives_up(self.timeline.at()) => {
                         self.timeline.abandon();
                     }
-                    Progress::Blocked => return Poll::Wait(None),
+                    Progress::Blocked => {
+                        // Others may wait for what has become certain since, before they tell what we wait for.
+                        self.send_absents();
+                        return Poll::Wait(None);
+                    }
                     Progress::TagDone => self.complete(),
                 }
             } else if self.timeline.overflowed() {
@@ -334,6 +341,10 @@ impl Federate {
             return Err(Poll::Wait(None));
         };
         if self.stop.only_shutdown(next) {
+            // Ordinary messages may still come up to the limit: it must be passed as any tag.
+            if let Some(gate) = self.stop.gate() {
+                self.permit(now, gate.min(self.timeline.stop_tag()))?;
+            }
             self.timeline.begin_shutdown_only(&mut self.present);
         } else {
             let next = self.permit(now, next)?;

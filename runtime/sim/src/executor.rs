@@ -13,6 +13,9 @@ use ictus_core::{
 
 /// What the simulated world asks of an executor beyond coordination.
 pub trait SimulatedExecutor: FederateExecutor {
+    /// Learns the start tag.
+    fn started(&mut self, start: Tag);
+
     /// Makes the value of an event from outside, and names the physical action; `None` when there is no such action.
     fn outside(&mut self, draw: u64) -> Option<(ActionId, ValueId)>;
 
@@ -258,9 +261,6 @@ impl SyntheticExecutor {
 
 impl Executor for SyntheticExecutor {
     fn begin(&mut self, tag: Tag) {
-        if self.start == Tag::NEVER {
-            self.start = tag;
-        }
         self.tag = tag;
         self.arrivals = 0;
         for slot in self.touched.drain(..) {
@@ -318,6 +318,10 @@ impl FederateExecutor for SyntheticExecutor {
 }
 
 impl SimulatedExecutor for SyntheticExecutor {
+    fn started(&mut self, start: Tag) {
+        self.start = start;
+    }
+
     fn outside(&mut self, draw: u64) -> Option<(ActionId, ValueId)> {
         let count = self.assembly.physical.len();
         if count == 0 {

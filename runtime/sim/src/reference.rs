@@ -1,6 +1,6 @@
 //! The same federation in one program, without RTI and network: the trace that every run must repeat.
 
-use crate::executor::{Record, SyntheticExecutor};
+use crate::executor::{Record, SimulatedExecutor as _, SyntheticExecutor};
 use crate::program::Federation;
 use ictus_core::{
     ActionId, Delay, Duration, Effects, Executor as _, NodeKind, PhysicalTime, Progress, Tag,
@@ -42,6 +42,7 @@ pub fn reference(
     let mut timeline = Timeline::new(program);
     let end = stop.map_or(Tag::FOREVER, after_start);
     timeline.start(START, end);
+    executor.started(START);
     let mut ordered = events.to_vec();
     ordered.sort_by_key(|e| e.tag);
     for event in &ordered {

@@ -149,7 +149,7 @@ fn judge(
         }
     }
     if run.start.is_some() {
-        check_stops(swarm, run)?;
+        check_stops(federation, swarm, run)?;
         check_trace(federation, swarm, run)?;
     }
     Ok(())
@@ -165,7 +165,10 @@ fn check_outcomes(run: &Run<SyntheticExecutor>) -> Result<(), Violation> {
             (Some(Outcome::PeerLost(lost)), Some(Victim::Federate(victim))) => {
                 usize::from(*lost) == victim
             }
-            (Some(Outcome::RtiFailed), Some(Victim::Federate(_))) => run.start.is_none(),
+            (
+                Some(Outcome::RtiFailed | Outcome::Rejected(_) | Outcome::RtiLost),
+                Some(Victim::Federate(_)),
+            ) => run.start.is_none(),
             (Some(Outcome::RtiLost), Some(Victim::Rti)) => true,
             (Some(_), _) => false,
         };
@@ -194,6 +197,9 @@ fn check_trace(
         .flat_map(|(federate, m)| m.executor.outside_events(federate, start))
         .collect();
     let stop = common_stop(run, start);
+    if stop.is_none() && swarm.ending != Ending::Starvation {
+        return Ok(());
+    }
     let mut expected = reference(federation, &events, stop);
     expected.sort_unstable();
     for (index, member) in run.members.iter().enumerate() {
@@ -203,7 +209,7 @@ fn check_trace(
         let limit = Limit::new(member.stop, member.at, run, index, swarm);
         let mut actual: Vec<Record> = member.executor.trace().to_vec();
         actual.sort_unstable();
-        check_limit(index, &limit, &actual, start)?;
+        check_limit(index, &limit, &actual, &expected, start)?;
         let wanted = expected.iter().filter(mine);
         let wanted: Vec<Record> = wanted.filter(|r| limit.covers(r, start)).copied().collect();
         let got: Vec<Record> = actual.into_iter().filter(|r| limit.covers(r, start)).collect();
@@ -212,10 +218,11 @@ fn check_trace(
     Ok(())
 }
 
-/// Where the reference stops.
+/// Where the reference stops: nowhere, if nobody has started.
 fn common_stop(run: &Run<SyntheticExecutor>, start: Tag) -> Option<(Duration, u32)> {
-    let stop = survivors(run).map(|(_, m)| m.stop).max()?;
-    (stop != Tag::FOREVER).then(|| since(stop, start))
+    let stops = survivors(run).map(|(_, m)| m.stop);
+    let stop = stops.filter(|stop| *stop != Tag::FOREVER).max()?;
+    Some(since(stop, start))
 }
 
 /// The federates that did not die.
@@ -224,17 +231,26 @@ fn survivors(run: &Run<SyntheticExecutor>) -> impl Iterator<Item = (usize, &Ende
     run.members.iter().enumerate().filter(move |(index, _)| !died(*index))
 }
 
-/// All who take part in a stop stop at the same tag.
-fn check_stops(swarm: &Swarm, run: &Run<SyntheticExecutor>) -> Result<(), Violation> {
+/// All who take part in a stop stop at the same tag; others have ended at the time-out before it was agreed.
+fn check_stops(
+    federation: &Federation,
+    swarm: &Swarm,
+    run: &Run<SyntheticExecutor>,
+) -> Result<(), Violation> {
+    let (Some(start), Some(timeout)) = (run.start, federation.timeout) else {
+        return Ok(());
+    };
     if run.victim == Some(Victim::Rti) || swarm.ending == Ending::Starvation {
         return Ok(());
     }
-    let mut stops = survivors(run);
-    let Some((first, member)) = stops.next() else { return Ok(()) };
-    match stops.find(|(_, other)| other.stop != member.stop) {
+    let end = start.delayed(Delay::Time(timeout));
+    let stops = survivors(run).filter(|(_, m)| m.stop != Tag::FOREVER && m.stop != end);
+    let mut stops = stops.map(|(index, m)| (index, m.stop));
+    let Some((first, stop)) = stops.next() else { return Ok(()) };
+    match stops.find(|(_, other)| *other != stop) {
         Some((second, other)) => Err(Violation {
             checker: "stop",
-            what: format!("{first} stopped at {}, {second} at {}", member.stop, other.stop),
+            what: format!("{first} stopped at {stop}, {second} at {other}"),
         }),
         None => Ok(()),
     }
@@ -270,11 +286,13 @@ impl Limit {
                 let agreed = survivors(run).map(|(_, m)| m.stop).max();
                 at.min(agreed.unwrap_or(at)).latest_earlier()
             }
-            Some(Victim::Federate(_)) => promise.map_or(stop, |p| p.min(stop)),
+            Some(Victim::Federate(_)) => promise.map_or(before_stop, |p| p.min(before_stop)),
             // The last tag may have been left half done, and shutdown ran early.
             Some(Victim::Rti) if at >= stop => before_stop.latest_earlier(),
             Some(Victim::Rti) => at.latest_earlier(),
             None if swarm.ending == Ending::Starvation => before_stop,
+            // Others ended later, and ran no shutdown at this one's stop tag.
+            None if survivors(run).any(|(_, m)| m.stop > stop) => before_stop,
             None => stop,
         };
         Self {
@@ -289,19 +307,21 @@ impl Limit {
     }
 }
 
-/// No ordinary reaction past the promise of a lost one.
+/// No ordinary reaction past the promise of a lost one, but for what did not depend on it at the one tag that had been
+/// entered before the loss was known.
 fn check_limit(
     index: usize,
     limit: &Limit,
     records: &[Record],
+    expected: &[Record],
     start: Tag,
 ) -> Result<(), Violation> {
     let Some(promise) = limit.promise else { return Ok(()) };
     let (promise, stop) = (since(promise, start), since(limit.stop, start));
-    let past = records
-        .iter()
-        .find(|r| (r.time, r.microstep) > promise && (r.time, r.microstep) < stop);
-    match past {
+    let tag = |r: &Record| (r.time, r.microstep);
+    let mut past = records.iter().filter(|r| tag(r) > promise && tag(r) < stop);
+    let entered = past.clone().next().map(tag);
+    match past.find(|r| Some(tag(r)) != entered || expected.binary_search(r).is_err()) {
         Some(record) => Err(Violation {
             checker: "promise",
             what: format!("federate {index} ran {record:?} past {promise:?}, stop {stop:?}"),

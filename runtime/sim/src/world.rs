@@ -46,7 +46,7 @@ pub struct Conditions {
 const LONGEST: i64 = 900_000_000_000;
 
 /// No survivor may need longer after a crash (true time).
-const LONGEST_AFTER_CRASH: i64 = 9_000_000_000;
+const LONGEST_AFTER_CRASH: i64 = 20_000_000_000;
 
 /// More events than any run needs.
 const MOST_EVENTS: u64 = 3_000_000;
@@ -211,7 +211,7 @@ impl<E: SimulatedExecutor> World<E> {
     fn slowness(&self) -> i64 {
         let network = &self.conditions.swarm.network;
         let partitions = i64::try_from(network.partitions).unwrap_or(0);
-        400 * network.delay_max.as_nanos() + partitions * network.partition.as_nanos()
+        2_000 * network.delay_max.as_nanos() + partitions * network.partition.as_nanos()
     }
 
     fn describe_stuck(&self) -> String {

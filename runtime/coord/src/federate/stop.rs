@@ -44,6 +44,14 @@ impl Stop {
         self.abandoned.is_some() || (self.consensus == Consensus::Granted && self.past_limit(next))
     }
 
+    /// The first tag at which only shutdown may run, unless no grant will come any more.
+    pub(super) fn gate(&self) -> Option<Tag> {
+        if self.abandoned.is_some() {
+            return None;
+        }
+        self.limit.map(Tag::successor)
+    }
+
     fn past_limit(&self, tag: Tag) -> bool {
         self.limit.is_some_and(|limit| tag > limit)
     }

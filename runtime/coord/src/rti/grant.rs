@@ -275,7 +275,8 @@ fn provisional_grant(view: &View<'_>, federate: FederateId) -> Option<Grant> {
 /// zero-delay cycle executes `tag` and reports its absent outputs.
 #[must_use]
 pub fn fan_out_grant(view: &View<'_>, upstream: FederateId, tag: Tag) -> Option<Grant> {
-    if view.mutants.has(Mutant::ProvisionalFanOutDropped) {
+    let needs_none = view.topology.upstream(upstream).is_empty();
+    if needs_none || view.mutants.has(Mutant::ProvisionalFanOutDropped) {
         return None;
     }
     let earliest = view.earliest_incoming(upstream);

@@ -155,6 +155,9 @@ impl Rti {
         let confirmed = standing.completed.next_microstep().unwrap_or(Tag::NEVER);
         standing.next_event = next_event.max(confirmed);
         self.detach(federate, Presence::Lost);
+        // Nothing passes through it any more: a cycle over it would wait for itself.
+        self.members[federate.index()].neighbors.upstream.clear();
+        self.topology = self.told_topology();
         self.touched.next_event(federate);
         self.touched.completed(federate);
         self.tell_lost(federate);

@@ -231,7 +231,7 @@ impl Rti {
         self.refuse_strangers();
     }
 
-    fn told_topology(&self) -> Topology {
+    pub(super) fn told_topology(&self) -> Topology {
         let mut neighbors: Vec<_> = self
             .members
             .iter()

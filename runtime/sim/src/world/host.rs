@@ -180,6 +180,10 @@ impl<E: SimulatedExecutor> World<E> {
                 self.observer.coverage.hit(Feature::SplitMessage);
             }
             host.received.drain(..used);
+            let start = host.federate.timeline().start_tag();
+            if start != Tag::NEVER {
+                host.executor.started(start);
+            }
         }
         if gone {
             host.federate.handle_disconnect();
