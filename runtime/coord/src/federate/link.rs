@@ -69,6 +69,7 @@ impl LinkConfig {
         let neighbors = topology.neighbor_structure(me);
         let in_cycle = zero_delay_cycle_inputs(plan, &topology, me);
         let input = |index: &usize| InputLink {
+            federate: plan.connections[*index].from.federate,
             port_id: plan.connections[*index].port_id,
             in_cycle: in_cycle.contains(index),
         };
@@ -97,6 +98,8 @@ impl LinkConfig {
 /// A network input on the wire.
 #[derive(Clone, Copy, Debug)]
 pub struct InputLink {
+    /// The sending federate.
+    pub federate: u16,
     /// The port id that senders use.
     pub port_id: u16,
     /// Whether it comes without delay from a member of this federate's zero-delay cycle: a provisional grant leaves
@@ -349,6 +352,15 @@ impl Link {
         }
         if timeline.current().is_none() && timeline.at() >= tag {
             self.confirm(tag);
+        }
+    }
+
+    /// Takes FEDERATE_LOST: what `federate` has not sent up to `promise` it never will.
+    pub(super) fn settle_lost(&self, federate: u16, promise: Tag, timeline: &mut Timeline) {
+        for (index, input) in self.config.inputs.iter().enumerate() {
+            if input.federate == federate {
+                timeline.settle(InputId::new(index), promise);
+            }
         }
     }
 

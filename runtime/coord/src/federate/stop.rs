@@ -126,6 +126,9 @@ impl Federate {
     /// Takes FEDERATE_LOST: after `limit`, an absence could be a lie.
     pub(super) fn peer_lost(&mut self, federate: u16, limit: Tag) {
         self.stop.limit = Some(self.stop.limit.map_or(limit, |earlier| earlier.min(limit)));
+        if let Some(link) = &self.link {
+            link.settle_lost(federate, limit, &mut self.timeline);
+        }
         if self.stop.lost.is_none() {
             self.stop.lost = Some(federate);
             self.events.push_back(FederateEvent::PeerLost(federate));

@@ -156,6 +156,9 @@ impl Rti {
         while let Some((federate, tag)) = provisional.pop() {
             for at in 0..self.topology.upstream(federate).len() {
                 let (upstream, _) = self.topology.upstream(federate)[at];
+                if !self.topology.share_zero_delay_cycle(upstream, federate) {
+                    continue;
+                }
                 let view = self.view(self.lost_rule(upstream), start);
                 if let Some(grant) = fan_out_grant(&view, upstream, tag) {
                     self.send_grant(upstream, grant, &mut provisional);

@@ -7,6 +7,7 @@ use crate::executor::SimulatedExecutor;
 use crate::network::{Arrival, Pipe};
 use crate::observer::Position;
 use crate::seed::Rng;
+use crate::swarm::Ending;
 use ictus_coord::federate::{Counters, Federate, FederateEvent, Poll};
 use ictus_core::{Duration, NodeId, PhysicalTime, Tag};
 
@@ -31,6 +32,8 @@ pub(super) struct Host<E> {
     in_flight: Vec<NodeId>,
     batches: usize,
     finished_writing: bool,
+    /// Ends when nothing is left.
+    starves: bool,
 }
 
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
@@ -65,6 +68,7 @@ impl<E: SimulatedExecutor> Host<E> {
             in_flight: Vec::new(),
             batches: 0,
             finished_writing: false,
+            starves: conditions.swarm.ending == Ending::Starvation,
         }
     }
 
@@ -93,7 +97,9 @@ impl<E: SimulatedExecutor> Host<E> {
             return Position::NOWHERE;
         }
         let executing = timeline.current().is_some();
-        let next = if self.is_over() || timeline.finished() {
+        // What is written at the end of a program that has nothing left stays in the federate.
+        let starved = self.starves && timeline.at() >= timeline.stop_tag();
+        let next = if self.is_over() || timeline.finished() || starved {
             Tag::FOREVER
         } else if executing && !self.executor.quiet() {
             timeline.at()

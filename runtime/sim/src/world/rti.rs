@@ -5,7 +5,7 @@ use crate::clock::HostClock;
 use crate::executor::SimulatedExecutor;
 use crate::network::Arrival;
 use crate::seed::Rng;
-use ictus_coord::rti::{Closing, ConnectionId, Disconnect, Rti, RtiConfig};
+use ictus_coord::rti::{Closing, ConnectionId, Disconnect, Rti, RtiConfig, RtiEvent};
 use ictus_core::Duration;
 
 #[derive(Debug)]
@@ -26,6 +26,7 @@ struct Peer {
     end: Option<Disconnect>,
     /// Our writing half is shut down.
     half_closed: bool,
+    joined: bool,
 }
 
 impl RtiHost {
@@ -144,6 +145,10 @@ impl<E: SimulatedExecutor> World<E> {
             if let (Some(connection), Some(end)) = (peer.connection, peer.end.take()) {
                 peer.connection = None;
                 self.rti.rti.disconnect(now, connection, &end);
+                if !peer.joined {
+                    // Whoever started the processes gives up: the RTI cannot know that this one will not come again.
+                    self.rti.rti.request_stop(now);
+                }
                 self.hosts[federate].down.close(self.now, &mut self.wakes);
                 self.wake_for_arrivals(federate);
                 self.rti_decide();
@@ -171,7 +176,11 @@ impl<E: SimulatedExecutor> World<E> {
             self.obey(federate, closing);
             self.wake_for_arrivals(federate);
         }
-        while self.rti.rti.poll_event().is_some() {}
+        while let Some(event) = self.rti.rti.poll_event() {
+            if let RtiEvent::Joined { federate } = event {
+                self.rti.peers[federate.index()].joined = true;
+            }
+        }
     }
 
     fn obey(&mut self, federate: usize, closing: Closing) {
