@@ -374,7 +374,10 @@ impl Federate {
     fn permit(&mut self, now: PhysicalTime, next: Tag) -> Result<Tag, Poll> {
         if let Some(link) = &mut self.link {
             let promise = match self.physical_delay {
-                Some(delay) if !self.config.fast => now.saturating_add(delay),
+                // Nothing from outside can come before the start.
+                Some(delay) if !self.config.fast => now
+                    .saturating_add(delay)
+                    .max(self.timeline.start_tag().time.as_physical()),
                 Some(_) | None => PhysicalTime::FOREVER,
             };
             let permission = link.permit(now, next, promise);

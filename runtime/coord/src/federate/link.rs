@@ -12,6 +12,9 @@ use std::collections::VecDeque;
 /// How often a federate with physical actions renews its promise when it is not known what downstreams wait for.
 const ADVANCE_INTERVAL: Duration = Duration::from_millis(10);
 
+/// Promises that nobody is known to wait for are at least this far apart: in a zero-delay cycle each is answered.
+const PROMISE_SPACING: Duration = Duration::from_millis(1);
+
 /// Clock exchanges while joining; both sides must count the same. Source: section 3.5 of the wire document.
 const CLOCK_EXCHANGES: u32 = 10;
 
@@ -130,12 +133,16 @@ pub(super) struct Link {
     pub(super) config: LinkConfig,
     out: Vec<u8>,
     granted: Tag,
-    provisional: Option<Tag>,
+    /// Tags granted provisionally, ascending; others wait for what happens here at each of them, so each is executed, also
+    /// when a later grant has come.
+    provisional: VecDeque<Tag>,
     /// What the RTI takes for the next event here: the last NET, sent or pending, or the tag of a message since.
     announced: Tag,
     /// The last NET that was found needless, until one is sent.
     skipped: Option<Tag>,
     skipped_count: u64,
+    /// When the last promise was made.
+    promised_at: PhysicalTime,
     not_needed_through: Option<Tag>,
     pending_announcement: Option<Tag>,
     pending_confirmation: Option<Tag>,
@@ -168,10 +175,11 @@ impl Link {
         Self {
             out: Vec::new(),
             granted: Tag::NEVER,
-            provisional: None,
+            provisional: VecDeque::new(),
             announced: Tag::NEVER,
             skipped: None,
             skipped_count: 0,
+            promised_at: PhysicalTime::NEVER,
             not_needed_through: None,
             pending_announcement: None,
             pending_confirmation: None,
@@ -210,11 +218,10 @@ impl Link {
         self.announced
     }
 
-    /// The tag of a provisional grant that is still to be executed, FOREVER when there is none.
+    /// The first provisionally granted tag that is still to be executed, FOREVER when there is none.
     pub(super) fn provisional_tag(&self, at: Tag) -> Tag {
-        self.provisional
-            .filter(|tag| *tag > at)
-            .unwrap_or(Tag::FOREVER)
+        let ahead = |tag: &&Tag| **tag > at;
+        self.provisional.iter().find(ahead).map_or(Tag::FOREVER, |tag| *tag)
     }
 
     pub(super) fn neighbors(&self) -> NeighborStructure {
@@ -269,7 +276,14 @@ impl Link {
     }
 
     fn promise(&mut self, now: PhysicalTime, next: Tag, promise: PhysicalTime) -> Permission {
-        self.announce(Tag::new(promise.as_logical(), 0));
+        let tag = Tag::new(promise.as_logical(), 0);
+        let waited_for = self
+            .not_needed_through
+            .is_some_and(|through| (self.announced..tag).contains(&through));
+        if waited_for || now >= self.promised_at.saturating_add(PROMISE_SPACING) {
+            self.promised_at = now;
+            self.announce(tag);
+        }
         let delay = promise.since(now);
         let renew = match self.not_needed_through {
             Some(Tag::FOREVER) => None,
@@ -279,7 +293,7 @@ impl Link {
                     .as_physical()
                     .saturating_add(Duration::NANOSECOND - delay),
             ),
-            Some(_) | None => Some(now.saturating_add(ADVANCE_INTERVAL)),
+            Some(_) | None => Some(self.promised_at.saturating_add(ADVANCE_INTERVAL)),
         };
         let due = (next.time != LogicalTime::FOREVER)
             .then(|| next.time.as_physical().saturating_add(-delay));
@@ -331,17 +345,22 @@ impl Link {
             return;
         }
         self.granted = tag;
-        self.provisional = None;
+        self.forget_provisional(timeline.at());
         timeline.settle_all(tag);
+    }
+
+    fn forget_provisional(&mut self, at: Tag) {
+        while self.provisional.front().is_some_and(|tag| *tag <= at) {
+            self.provisional.pop_front();
+        }
     }
 
     /// Takes a PTAG: `tag` may be entered, but what comes over the cycle is unknown at it.
     pub(super) fn grant_provisionally(&mut self, tag: Tag, timeline: &mut Timeline) {
-        if tag < self.granted || (tag == self.granted && self.provisional.is_none()) {
+        if tag < self.granted {
             return;
         }
         self.granted = tag;
-        self.provisional = Some(tag);
         for (index, input) in self.config.inputs.iter().enumerate() {
             let through = if input.in_cycle {
                 tag.latest_earlier()
@@ -350,7 +369,14 @@ impl Link {
             };
             timeline.settle(InputId::new(index), through);
         }
-        if timeline.current().is_none() && timeline.at() >= tag {
+        self.forget_provisional(timeline.at());
+        if timeline.at() < tag {
+            self.provisional.push_back(tag);
+        } else if timeline.current() != Some(tag) {
+            // It is over: what was not sent at it never will be.
+            for index in 0..self.senders.len() {
+                self.say_absent(self.senders[index].1, tag);
+            }
             self.confirm(tag);
         }
     }
@@ -446,20 +472,23 @@ impl Link {
     /// PORT_ABSENT for every output that can no longer be set at the current tag.
     pub(super) fn send_absents(&mut self, timeline: &Timeline) {
         let Some(at) = timeline.current() else { return };
-        for (node, output) in &self.senders {
-            let told = &mut self.told_at[node.index()];
-            if *told != at && timeline.settled_without(*node) {
-                *told = at;
-                let link = self.config.outputs[output.index()];
-                let tag = at.delayed_strict(link.delay);
-                let absent = PortAbsent {
-                    port: link.port_id,
-                    federate: link.federate,
-                    tag,
-                };
-                ToRti::PortAbsent(absent).encode(&mut self.out);
+        for index in 0..self.senders.len() {
+            let (node, output) = self.senders[index];
+            if self.told_at[node.index()] != at && timeline.settled_without(node) {
+                self.told_at[node.index()] = at;
+                self.say_absent(output, at);
             }
         }
+    }
+
+    fn say_absent(&mut self, output: OutputId, at: Tag) {
+        let link = self.config.outputs[output.index()];
+        let absent = PortAbsent {
+            port: link.port_id,
+            federate: link.federate,
+            tag: at.delayed_strict(link.delay),
+        };
+        ToRti::PortAbsent(absent).encode(&mut self.out);
     }
 
     /// From now on nothing is sent to other federates: they have been told that nothing will come.

@@ -138,7 +138,7 @@ impl Rti {
 
     /// A federate is gone without resigning; its connection has been dealt with.
     ///
-    /// What it promised last stands: its LTC and its NET, whichever is later. Others stop as soon as they can.
+    /// What it promised last stands, as far as nothing could come from upstream. Others stop as soon as they can.
     pub(super) fn lose(&mut self, federate: FederateId, reason: String) {
         if self.members[federate.index()].stage == Stage::Gone {
             return;
@@ -150,7 +150,9 @@ impl Rti {
             self.abort_all();
             return;
         };
-        let next_event = self.view(LostRule::Limits, start).next_event(federate);
+        // What was still to reach it would have made it send, whatever it had announced.
+        let view = self.view(LostRule::Limits, start);
+        let next_event = view.next_event(federate).min(view.earliest_incoming(federate));
         let standing = &mut self.standings[federate.index()];
         let confirmed = standing.completed.next_microstep().unwrap_or(Tag::NEVER);
         standing.next_event = next_event.max(confirmed);

@@ -40,6 +40,8 @@ impl Rti {
                     let sender = &mut self.members[from.index()];
                     sender.known_dnet = sender.known_dnet.min(message.tag);
                     sender.last_relayed = sender.last_relayed.max(message.tag);
+                    let before = message.tag.latest_earlier();
+                    sender.downstream_confirmed = sender.downstream_confirmed.min(before);
                     self.relay_message(to, message.tag, &bytes[..consumed]);
                 } else {
                     self.fail(from, format!("it sends to federate {}", message.federate));
@@ -57,6 +59,8 @@ impl Rti {
     fn relay_message(&mut self, to: FederateId, tag: Tag, bytes: &[u8]) {
         let standing = &mut self.standings[to.index()];
         if standing.presence != Presence::Present {
+            // Dropped is as good as handled: its sender must not wait for it.
+            self.touched.completed(to);
             return;
         }
         let ignored = self.config.mutants.has(Mutant::InTransitIgnored);
