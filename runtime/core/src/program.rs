@@ -178,6 +178,7 @@ pub struct ProgramBuilder {
     inputs: Vec<NetworkInput>,
     outputs: Vec<PortId>,
     concurrent: bool,
+    cones_by_level: bool,
 }
 
 /// An input that is fed by another federate.
@@ -204,6 +205,13 @@ impl ProgramBuilder {
     /// Says that reactions may be in flight at the same time, which needs the table of ancestors.
     pub fn concurrent(&mut self) {
         self.concurrent = true;
+    }
+
+    /// Makes reactions wait for inputs by level instead of by cone: the wrong rule, for the simulator's proof that it
+    /// notices.
+    #[doc(hidden)]
+    pub fn cones_by_level(&mut self) {
+        self.cones_by_level = true;
     }
 
     /// Adds a reactor instance with its whole path (`planner.filter[2]`).
@@ -360,8 +368,11 @@ impl ProgramBuilder {
             triggers.sort_unstable();
             triggers.dedup();
         }
-        let relations = (self.concurrent || !self.inputs.is_empty())
+        let mut relations = (self.concurrent || !self.inputs.is_empty())
             .then(|| Relations::new(&graph, &self.inputs, &slots, &tables));
+        if let Some(relations) = relations.as_mut().filter(|_| self.cones_by_level) {
+            relations.widen_to_levels(&graph.levels, self.inputs.len());
+        }
         let mut action_slots = vec![None; self.actions.len()];
         for (port, feed) in feeds.iter().enumerate() {
             if let Some(Feed::Queue(action)) = feed {
@@ -563,6 +574,21 @@ impl Relations {
         Self {
             ancestors: graph::ancestors(graph),
             cone: graph::closure(graph, direct),
+        }
+    }
+}
+
+impl Relations {
+    /// Every node from the level of an input's first reader on waits for the input.
+    fn widen_to_levels(&mut self, levels: &[u32], inputs: usize) {
+        for input in 0..inputs {
+            let reads = |node: &usize| self.cone[*node].contains(input);
+            let first = (0..levels.len()).filter(reads).map(|n| levels[n]).min();
+            for (node, level) in levels.iter().enumerate() {
+                if first.is_some_and(|first| *level >= first) {
+                    self.cone[node].insert(input);
+                }
+            }
         }
     }
 }
