@@ -21,6 +21,7 @@ mod join;
 mod link;
 mod stop;
 
+use crate::mutants::Mutant;
 use crate::payload::{FederateExecutor, PayloadError};
 use crate::wire::{DecodeError, RejectReason};
 use ictus_core::{
@@ -355,6 +356,9 @@ impl Federate {
         for (action, value) in self.present.drain(..) {
             executor.arrive(action, program.action_slot(action), value);
         }
+        if let Some(link) = &mut self.link {
+            link.confirm_too_early(self.timeline.at());
+        }
         self.send_absents();
         Ok(())
     }
@@ -375,9 +379,14 @@ impl Federate {
         if let Some(link) = &mut self.link {
             let promise = match self.physical_delay {
                 // Nothing from outside can come before the start.
-                Some(delay) if !self.config.fast => now
+                Some(delay)
+                    if !self.config.fast
+                        && !link.config.mutants.has(Mutant::PhysicalPromiseDropped) =>
+                {
+                    now
                     .saturating_add(delay)
-                    .max(self.timeline.start_tag().time.as_physical()),
+                        .max(self.timeline.start_tag().time.as_physical())
+                }
                 Some(_) | None => PhysicalTime::FOREVER,
             };
             let permission = link.permit(now, next, promise);

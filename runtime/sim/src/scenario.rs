@@ -97,7 +97,7 @@ pub fn simulate(
     let payload = if rng.fork(9).percent(10) { 3_000 } else { 0 };
     let members = (0..federation.federates.len()).map(|id| {
         let assembly = federation
-            .federate(id, swarm.mode.parallel)
+            .federate(id, swarm.mode.parallel, mutants)
             .expect("a federate of a federation without loops has none");
         let id = u16::try_from(id).unwrap_or(u16::MAX);
         let mut link = LinkConfig::from_plan(&plan, id, &assembly.inputs, &assembly.outputs);

@@ -1,6 +1,6 @@
 //! The link to the RTI under centralized coordination: what is announced (NET, LTC), granted (TAG, PTAG) and sent.
 
-use crate::mutants::Mutants;
+use crate::mutants::{Mutant, Mutants};
 use crate::plan::{ClockSync, ConnectionPlan, Plan};
 use crate::topology::{FederateId, Topology, connection_delay, zero_delay_cycle_inputs};
 use crate::wire::{self, NeighborStructure, PortAbsent, ToRti};
@@ -330,6 +330,9 @@ impl Link {
     /// Takes a DNET: announcements up to `through` are needless; one that was skipped after it is made good.
     pub(super) fn announcements_not_needed(&mut self, through: Tag) {
         self.not_needed_through = Some(through);
+        if self.config.mutants.has(Mutant::SkippedNextForgotten) {
+            return;
+        }
         if let Some(skipped) = self.skipped
             && through < skipped
         {
@@ -357,6 +360,10 @@ impl Link {
 
     /// Takes a PTAG: `tag` may be entered, but what comes over the cycle is unknown at it.
     pub(super) fn grant_provisionally(&mut self, tag: Tag, timeline: &mut Timeline) {
+        if self.config.mutants.has(Mutant::ProvisionalAsFull) {
+            self.grant(tag, timeline);
+            return;
+        }
         if tag < self.granted {
             return;
         }
@@ -395,6 +402,13 @@ impl Link {
     pub(super) fn completed(&mut self, tag: Tag, network_inputs_ran: bool) {
         if network_inputs_ran || self.config.in_cycle {
             self.confirm(tag);
+        }
+    }
+
+    /// What a wrong federate does: LTC when a tag is begun.
+    pub(super) fn confirm_too_early(&mut self, tag: Tag) {
+        if self.config.mutants.has(Mutant::ConfirmedBeforeMessages) {
+            ToRti::LatestTagConfirmed(tag).encode(&mut self.out);
         }
     }
 
@@ -482,6 +496,9 @@ impl Link {
     }
 
     fn say_absent(&mut self, output: OutputId, at: Tag) {
+        if self.config.mutants.has(Mutant::AbsentsDropped) {
+            return;
+        }
         let link = self.config.outputs[output.index()];
         let absent = PortAbsent {
             port: link.port_id,

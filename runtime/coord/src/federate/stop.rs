@@ -2,6 +2,7 @@
 
 use super::join::Phase;
 use super::{Federate, FederateEvent, Outcome, Poll};
+use crate::mutants::Mutant;
 use crate::wire::ToRti;
 use ictus_core::{PhysicalTime, Tag, Timeline};
 
@@ -68,6 +69,12 @@ impl Stop {
 }
 
 impl Federate {
+    fn has_mutant(&self, mutant: Mutant) -> bool {
+        self.link
+            .as_ref()
+            .is_some_and(|link| link.config.mutants.has(mutant))
+    }
+
     /// Asks for an ordered stop from outside (a signal): at the clock's time, or as soon as all can.
     pub fn request_stop(&mut self, now: PhysicalTime) {
         if !matches!(self.phase, Phase::Running) {
@@ -108,7 +115,11 @@ impl Federate {
         if self.stop.consensus != Consensus::None {
             return;
         }
-        let tag = tag.max(after(&self.timeline));
+        let tag = if self.has_mutant(Mutant::StopReplyTooEarly) {
+            tag
+        } else {
+            tag.max(after(&self.timeline))
+        };
         self.stop.consensus = Consensus::Barred(tag);
         self.events.push_back(FederateEvent::StopRequested);
         if let Some(link) = &mut self.link {
@@ -125,6 +136,11 @@ impl Federate {
 
     /// Takes FEDERATE_LOST: after `limit`, an absence could be a lie.
     pub(super) fn peer_lost(&mut self, federate: u16, limit: Tag) {
+        let limit = if self.has_mutant(Mutant::PromiseIgnored) {
+            Tag::FOREVER
+        } else {
+            limit
+        };
         self.stop.limit = Some(self.stop.limit.map_or(limit, |earlier| earlier.min(limit)));
         if let Some(link) = &self.link {
             link.settle_lost(federate, limit, &mut self.timeline);

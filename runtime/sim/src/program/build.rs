@@ -2,6 +2,7 @@
 
 use super::{Federation, PortRef, ReactionPlan, ReactorSpec};
 use crate::seed::mix;
+use ictus_coord::mutants::{Mutant, Mutants};
 use ictus_core::{
     ActionId, ActionKind, Delay, Duration, PortId, PortKind, Program, ProgramBuilder, ProgramError,
     ReactionSpec, SlotId, Trigger,
@@ -75,10 +76,18 @@ impl Federation {
     /// # Errors
     ///
     /// What is wrong with the federate.
-    pub fn federate(&self, federate: usize, concurrent: bool) -> Result<Assembly, ProgramError> {
+    pub fn federate(
+        &self,
+        federate: usize,
+        concurrent: bool,
+        mutants: Mutants,
+    ) -> Result<Assembly, ProgramError> {
         let mut builder = Builder::new();
         if concurrent {
             builder.program.concurrent();
+        }
+        if mutants.has(Mutant::AbsentsByLevel) {
+            builder.program.cones_by_level();
         }
         builder.add(self, federate);
         for (index, link) in self.links.iter().enumerate() {
