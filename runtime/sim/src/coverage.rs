@@ -48,6 +48,9 @@ features! {
     Partition => "partition",
     SplitMessage => "message split between reads",
     ClockOffset => "clock corrected while joining",
+    Foreign => "federates without our extensions",
+    LegacySource => "source that announces by LTC alone",
+    Calm => "run in which nothing may be late",
     Fast => "run ahead of physical time",
 }
 

@@ -62,6 +62,7 @@ fn parse(arguments: impl Iterator<Item = String>) -> Result<Options, String> {
             "--seed" => options.single.push(number()?),
             "--mutants" => options.mutants = true,
             "--dump" => options.dump = true,
+            "--" => {}
             _ => return Err(format!("unknown argument {argument}")),
         }
     }

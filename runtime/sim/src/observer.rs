@@ -74,6 +74,8 @@ pub struct Observer {
     pub log: Option<String>,
     /// True time in nanoseconds, for the log.
     pub now: i64,
+    /// Whether events come from outside.
+    pub physical: bool,
     /// What has happened so far.
     pub coverage: Coverage,
 }
@@ -95,6 +97,7 @@ impl Observer {
             violation: None,
             log: None,
             now: 0,
+            physical: false,
             coverage: Coverage::default(),
         }
     }
@@ -243,8 +246,9 @@ impl Observer {
             }
             ToFederate::TagAdvanceGrant(tag) => self.full_grant(to, *tag, truth),
             ToFederate::ProvisionalTagAdvanceGrant(tag) => self.provisional_grant(to, *tag, truth),
-            ToFederate::DownstreamNextEventTag(_) => {
+            ToFederate::DownstreamNextEventTag(tag) => {
                 self.coverage.hit(Feature::DownstreamNextEvent);
+                self.needless_announcements(to, *tag, truth);
             }
             ToFederate::StopGranted(_) => self.stop_granted = true,
             ToFederate::FederateLost { promise, .. } => {
@@ -305,6 +309,27 @@ impl Observer {
         if tag > earliest || tag >= outside {
             let what = format!(
                 "PTAG{tag} to {to}, but a message may come with {earliest}, from outside its cycle with {outside}"
+            );
+            self.blame("grant oracle", what);
+        }
+    }
+
+    /// A NET at `tag` must not be what anybody downstream waits for.
+    fn needless_announcements(&mut self, to: usize, tag: Tag, truth: &[Position]) {
+        // A physical event comes to be known to its federate first.
+        if self.lost || self.physical || tag == Tag::NEVER {
+            return;
+        }
+        let sinks = self.topology.sinks(FederateId::from_index(to));
+        // The last microstep stands for "all of them": no path may overflow it.
+        let tag = Tag::new(tag.time, tag.microstep.min(1 << 20));
+        let waits = sinks.iter().find(|(sink, path)| {
+            sink.index() != to && tag.plus_path(*path) > truth[sink.index()].next
+        });
+        if let Some((sink, _)) = waits {
+            let what = format!(
+                "DNET{tag} to {to}, but {sink} waits to reach {}",
+                truth[sink.index()].next
             );
             self.blame("grant oracle", what);
         }

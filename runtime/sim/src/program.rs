@@ -26,6 +26,8 @@ pub struct Federation {
     pub max_lead: Option<Duration>,
     /// Clocks are compared while joining.
     pub clock_sync: bool,
+    /// Our extensions are used.
+    pub extensions: bool,
 }
 
 /// One federate: its first reactor is the federate itself.
@@ -153,7 +155,7 @@ impl Federation {
             } else {
                 ClockSync::Off
             },
-            extensions: true,
+            extensions: self.extensions,
             federates: federates.collect(),
             connections: connections.collect(),
         }

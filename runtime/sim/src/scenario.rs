@@ -94,6 +94,7 @@ pub fn simulate(
         .iter()
         .map(|c| ((c.to.federate, c.port_id), connection_delay(c)))
         .collect::<BTreeMap<_, _>>();
+    let legacy = legacy_sources(&topology, swarm);
     let payload = if rng.fork(9).percent(10) { 3_000 } else { 0 };
     let members = (0..federation.federates.len()).map(|id| {
         let assembly = federation
@@ -106,6 +107,7 @@ pub fn simulate(
             program: assembly.program.clone(),
             link,
             executor: SyntheticExecutor::new(assembly, payload),
+            legacy: legacy[usize::from(id)],
         }
     });
     let conditions = Conditions {
@@ -119,6 +121,7 @@ pub fn simulate(
     };
     let mut observer = Observer::new(topology, delays);
     observer.log = log.then(String::new);
+    observer.physical = swarm.shape.physical;
     World::new(members.collect(), observer, conditions, rng).run()
 }
 
@@ -133,13 +136,32 @@ fn remote_topology(federation: &Federation) -> Topology {
     )
 }
 
+/// The federates that may announce by LTC alone: they have no upstream, and whoever hears from them hears from no others
+/// and is heard by none, because the LTC rule reaches no further.
+fn legacy_sources(topology: &Topology, swarm: &Swarm) -> Vec<bool> {
+    let source = |f: FederateId| topology.upstream(f).is_empty();
+    let leaf = |f: FederateId| {
+        topology.downstream(f).is_empty() && topology.upstream(f).iter().all(|(u, _)| source(*u))
+    };
+    let may = |f| source(f) && topology.downstream(f).iter().all(|(d, _)| leaf(*d));
+    let wanted = swarm.mode.legacy_sources && !swarm.shape.physical;
+    // All sources of a leaf must, or none.
+    let all = |f: FederateId| {
+        topology
+            .downstream(f)
+            .iter()
+            .all(|(d, _)| topology.upstream(*d).iter().all(|(u, _)| may(*u)))
+    };
+    topology.federates().map(|f| wanted && may(f) && all(f)).collect()
+}
+
 /// The checkers that look at a run when it is over.
 fn judge(
     federation: &Federation,
     swarm: &Swarm,
     run: &Run<SyntheticExecutor>,
 ) -> Result<(), Violation> {
-    check_outcomes(run)?;
+    check_outcomes(swarm.mode.extensions, run)?;
     for (index, member) in run.members.iter().enumerate() {
         if let Some(node) = member.executor.unstable() {
             return Err(Violation {
@@ -155,7 +177,10 @@ fn judge(
     Ok(())
 }
 
-fn check_outcomes(run: &Run<SyntheticExecutor>) -> Result<(), Violation> {
+fn check_outcomes(
+    extensions: bool,
+    run: &Run<SyntheticExecutor>,
+) -> Result<(), Violation> {
     for (index, member) in run.members.iter().enumerate() {
         let right = match (&member.outcome, run.victim) {
             (None, Some(Victim::Federate(victim))) => victim == index,
@@ -165,6 +190,8 @@ fn check_outcomes(run: &Run<SyntheticExecutor>) -> Result<(), Violation> {
             (Some(Outcome::PeerLost(lost)), Some(Victim::Federate(victim))) => {
                 usize::from(*lost) == victim
             }
+            // Without our extensions it cannot be told up to where it may run.
+            (Some(Outcome::RtiFailed), Some(Victim::Federate(_))) if !extensions => true,
             (
                 Some(Outcome::RtiFailed | Outcome::Rejected(_) | Outcome::RtiLost),
                 Some(Victim::Federate(_)),
@@ -206,7 +233,7 @@ fn check_trace(
         let first = federation.first_reactor(index);
         let last = first + federation.federates[index].reactors.len();
         let mine = |r: &&Record| (first..last).contains(&(r.reactor as usize));
-        let limit = Limit::new(member.stop, member.at, run, index, swarm);
+        let limit = Limit::new(member, run, index, swarm);
         let mut actual: Vec<Record> = member.executor.trace().to_vec();
         actual.sort_unstable();
         check_limit(index, &limit, &actual, &expected, start)?;
@@ -245,6 +272,7 @@ fn check_stops(
     }
     let end = start.delayed(Delay::Time(timeout));
     let stops = survivors(run).filter(|(_, m)| m.stop != Tag::FOREVER && m.stop != end);
+    let stops = stops.filter(|(_, m)| !matches!(m.outcome, Some(Outcome::RtiFailed)));
     let mut stops = stops.map(|(index, m)| (index, m.stop));
     let Some((first, stop)) = stops.next() else { return Ok(()) };
     match stops.find(|(_, other)| *other != stop) {
@@ -272,12 +300,12 @@ struct Limit {
 
 impl Limit {
     fn new(
-        stop: Tag,
-        at: Tag,
+        member: &Ended<SyntheticExecutor>,
         run: &Run<SyntheticExecutor>,
         index: usize,
         swarm: &Swarm,
     ) -> Self {
+        let (stop, at) = (member.stop, member.at);
         let promise = run.observer.promise(index);
         let before_stop = stop.latest_earlier();
         let last = match run.victim {
@@ -285,6 +313,9 @@ impl Limit {
             Some(Victim::Federate(victim)) if victim == index => {
                 let agreed = survivors(run).map(|(_, m)| m.stop).max();
                 at.min(agreed.unwrap_or(at)).latest_earlier()
+            }
+            Some(Victim::Federate(_)) if matches!(member.outcome, Some(Outcome::RtiFailed)) => {
+                before_stop.latest_earlier()
             }
             Some(Victim::Federate(_)) => promise.map_or(before_stop, |p| p.min(before_stop)),
             // The last tag may have been left half done, and shutdown ran early.
@@ -398,6 +429,15 @@ fn cover_structure(federation: &Federation, coverage: &mut Coverage, swarm: &Swa
                 .any(|f| topology.upstream(*f).is_empty() && topology.downstream(*f).is_empty()),
         ),
         (Feature::Fast, swarm.mode.fast),
+        (Feature::Foreign, !swarm.mode.extensions),
+        (Feature::Calm, swarm.mode.calm),
+        (
+            Feature::LegacySource,
+            legacy_sources(&topology, swarm)
+                .iter()
+                .zip(&ids)
+                .any(|(legacy, id)| *legacy && !topology.downstream(*id).is_empty()),
+        ),
         (Feature::StopByReaction, swarm.ending == Ending::ReactionStop),
         (Feature::Starvation, swarm.ending == Ending::Starvation),
     ];

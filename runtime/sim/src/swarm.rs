@@ -54,6 +54,12 @@ pub struct Mode {
     pub dnet: bool,
     /// Sources yield after this many batches.
     pub slice: usize,
+    /// Federates and RTI use our extensions.
+    pub extensions: bool,
+    /// Where nothing else depends on it, sources announce progress by LTC alone, as TypeScript ones do.
+    pub legacy_sources: bool,
+    /// Nothing is slow: whatever is late is late for no good reason.
+    pub calm: bool,
 }
 
 /// What ends the run.
@@ -108,8 +114,7 @@ impl Swarm {
     pub fn draw(rng: &mut Rng) -> Self {
         let ending = draw_ending(rng);
         let physical = rng.percent(20) && ending != Ending::Starvation;
-        let fast = !physical && rng.percent(20);
-        Self {
+        let swarm = Self {
             federates: rng.between(2, 12),
             shape: Shape {
                 cycles: rng.percent(60),
@@ -118,22 +123,56 @@ impl Swarm {
                 delays: rng.percent(75),
                 physical,
             },
-            mode: Mode {
-                fast,
-                parallel: rng.percent(50),
-                reaction: *rng.pick(&[Duration::ZERO, 20.us(), 500.us(), 3.ms()]),
-                max_lead: rng.percent(35).then(|| rng.span(1.ms(), 8.ms())),
-                clock_sync: rng.percent(30),
-                dnet: rng.percent(85),
-                slice: rng.between(1, 40),
-            },
+            mode: draw_mode(physical, rng),
             ending,
             network: draw_network(rng),
             clocks: Clocks {
                 offset: *rng.pick(&[Duration::ZERO, 100.us(), 20.ms(), 2.secs()]),
                 drift: *rng.pick(&[0, 50, 500]),
             },
-        }
+        };
+        if rng.percent(12) { swarm.calmed() } else { swarm }
+    }
+
+    /// Without anything that takes time, and without cycles.
+    fn calmed(mut self) -> Self {
+        self.shape.cycles = false;
+        self.shape.zero_delay_cycles = false;
+        self.shape.physical = false;
+        self.mode.fast = false;
+        self.mode.reaction = Duration::ZERO;
+        self.mode.max_lead = None;
+        self.mode.legacy_sources = false;
+        self.mode.calm = true;
+        self.ending = Ending::Timeout;
+        self.network = Network {
+            delay_min: 10.us(),
+            delay_max: 11.us(),
+            cut: 20,
+            clog: 0,
+            partitions: 0,
+            partition: Duration::ZERO,
+        };
+        self.clocks = Clocks {
+            offset: Duration::ZERO,
+            drift: 0,
+        };
+        self
+    }
+}
+
+fn draw_mode(physical: bool, rng: &mut Rng) -> Mode {
+    Mode {
+        fast: !physical && rng.percent(20),
+        parallel: rng.percent(50),
+        reaction: *rng.pick(&[Duration::ZERO, 20.us(), 500.us(), 3.ms()]),
+        max_lead: rng.percent(35).then(|| rng.span(1.ms(), 8.ms())),
+        clock_sync: rng.percent(30),
+        dnet: rng.percent(85),
+        slice: rng.between(1, 40),
+        extensions: rng.percent(75),
+        legacy_sources: rng.percent(30),
+        calm: false,
     }
 }
 

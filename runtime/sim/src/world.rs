@@ -29,6 +29,8 @@ pub struct Member<E> {
     pub link: LinkConfig,
     /// Its values and reaction bodies.
     pub executor: E,
+    /// Whether it announces progress by LTC alone, as TypeScript sources do.
+    pub legacy: bool,
 }
 
 /// How the world treats a federation.

@@ -306,6 +306,9 @@ impl Link {
             self.skipped = None;
             return;
         }
+        if self.forgets_skipped() && self.skipped == Some(next) {
+            return;
+        }
         let needed = self.not_needed_through.is_none_or(|through| through < next)
             || (!self.config.upstream.is_empty() && self.granted < next);
         if needed {
@@ -316,6 +319,10 @@ impl Link {
             self.skipped = Some(next);
             self.skipped_count += 1;
         }
+    }
+
+    const fn forgets_skipped(&self) -> bool {
+        self.config.mutants.has(Mutant::SkippedNextForgotten)
     }
 
     /// A message has come: the RTI counts its tag as announced if it is earlier than what was.
@@ -330,7 +337,7 @@ impl Link {
     /// Takes a DNET: announcements up to `through` are needless; one that was skipped after it is made good.
     pub(super) fn announcements_not_needed(&mut self, through: Tag) {
         self.not_needed_through = Some(through);
-        if self.config.mutants.has(Mutant::SkippedNextForgotten) {
+        if self.forgets_skipped() {
             return;
         }
         if let Some(skipped) = self.skipped

@@ -24,6 +24,7 @@ impl Federation {
             fast: swarm.mode.fast,
             max_lead: swarm.mode.max_lead,
             clock_sync: swarm.mode.clock_sync,
+            extensions: swarm.mode.extensions,
         };
         for id in 0..swarm.federates {
             let inputs = federation.links.iter().filter(|l| l.to.0 == id).count();

@@ -9,7 +9,9 @@ use crate::observer::Position;
 use crate::seed::Rng;
 use crate::swarm::Ending;
 use ictus_coord::federate::{Counters, Federate, FederateEvent, Poll};
-use ictus_core::{Duration, NodeId, PhysicalTime, Tag};
+use ictus_coord::wire::{ToRti, kind};
+use ictus_core::{ActionId, ActionKind, Duration, NodeId, PhysicalTime, Tag};
+use std::collections::BTreeMap;
 
 /// One host with one federate.
 #[derive(Debug)]
@@ -34,6 +36,14 @@ pub(super) struct Host<E> {
     finished_writing: bool,
     /// Ends when nothing is left.
     starves: bool,
+    /// Announces progress by LTC alone.
+    legacy: bool,
+    /// Resigns without a last NET.
+    terse: bool,
+    /// The last tag whose lateness was looked at.
+    timed: Tag,
+    /// The last tag that an event from outside got, per action.
+    outside: BTreeMap<ActionId, Tag>,
 }
 
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
@@ -59,7 +69,6 @@ impl<E: SimulatedExecutor> Host<E> {
             clock: HostClock::new(offset, drift),
             up: Pipe::new(rng.fork(1), network),
             down: Pipe::new(rng.fork(2), network),
-            rng,
             state: State::Waiting,
             received: Vec::new(),
             shown: 0,
@@ -69,6 +78,11 @@ impl<E: SimulatedExecutor> Host<E> {
             batches: 0,
             finished_writing: false,
             starves: conditions.swarm.ending == Ending::Starvation,
+            legacy: member.legacy,
+            terse: rng.percent(15),
+            timed: Tag::NEVER,
+            outside: BTreeMap::new(),
+            rng,
         }
     }
 
@@ -112,6 +126,22 @@ impl<E: SimulatedExecutor> Host<E> {
             next,
             stop: timeline.stop_tag(),
         }
+    }
+
+    /// Whether an event got a later tag than any promise made so far can ask for.
+    fn deferred_too_far(&self, action: ActionId, tag: Tag, last: Option<Tag>, now: i64) -> bool {
+        let program = self.federate.timeline().program();
+        let ActionKind::Physical {
+            min_delay,
+            min_spacing,
+        } = program.actions()[action.index()]
+        else {
+            return false;
+        };
+        let start = self.federate.timeline().start_tag().time;
+        let by_now = self.clock.reading(now).saturating_add(min_delay).as_logical();
+        let spaced = last.map_or(start, |tag| tag.time + min_spacing);
+        tag.time > by_now.max(spaced).max(start)
     }
 
     pub(super) fn woken(&mut self, now: i64) -> bool {
@@ -223,6 +253,27 @@ impl<E: SimulatedExecutor> World<E> {
         }
         let position = self.hosts[federate].position();
         self.observer.federate_ran(federate, position);
+        if self.conditions.swarm.mode.calm {
+            self.check_lateness(federate, position);
+        }
+    }
+
+    /// In a calm run a tag is begun when it is due, but for what messages need on their way.
+    fn check_lateness(&mut self, federate: usize, position: Position) {
+        let host = &mut self.hosts[federate];
+        let started = host.federate.timeline().start_tag() != Tag::NEVER;
+        let known = std::mem::replace(&mut host.timed, position.at) == position.at;
+        if known || !started || position.at < host.federate.timeline().start_tag() {
+            return;
+        }
+        let due = host.clock.when(position.at.time.as_physical());
+        let late = self.now - due.unwrap_or(self.now);
+        let count = i64::try_from(self.hosts.len()).unwrap_or(i64::MAX);
+        let bound = 6 * (count + 1) * self.conditions.swarm.network.delay_max.as_nanos() + 50_000;
+        if late > bound {
+            let what = format!("federate {federate} began {} late by {late} ns", position.at);
+            self.observer.blame("promptness", what);
+        }
     }
 
     /// Starts what is ready; says whether to go on polling at once.
@@ -282,8 +333,15 @@ impl<E: SimulatedExecutor> World<E> {
         self.hosts[federate].federate.flush();
         self.show(federate);
         let host = &mut self.hosts[federate];
+        let timeline = host.federate.timeline();
+        let done = (timeline.at() >= timeline.start_tag()).then(|| timeline.at());
         if let Some(output) = host.federate.output() {
-            host.up.write(self.now, output, &mut self.wakes);
+            if host.legacy || host.terse {
+                let rewritten = rewrite(output, host.legacy, done);
+                host.up.write(self.now, &rewritten, &mut self.wakes);
+            } else {
+                host.up.write(self.now, output, &mut self.wakes);
+            }
             output.clear();
             host.shown = 0;
         }
@@ -349,6 +407,12 @@ impl<E: SimulatedExecutor> World<E> {
             let stamp = host.clock.reading(now - late.as_nanos());
             let tag = host.federate.schedule_physical(stamp, action, value);
             host.executor.stamped(tag);
+            let last = host.outside.insert(action, tag);
+            let late = host.deferred_too_far(action, tag, last, now);
+            if late {
+                let what = format!("event from outside at {stamp:?} got {tag} in federate {federate}");
+                self.observer.blame("promptness", what);
+            }
             self.observer.coverage.hit(Feature::PhysicalAction);
             if tag.time > stamp.as_logical() && tag.microstep == 0 {
                 self.observer.coverage.hit(Feature::PhysicalDeferred);
@@ -367,4 +431,23 @@ impl<E: SimulatedExecutor> World<E> {
             self.drive(federate);
         }
     }
+}
+
+/// What other implementations write in place of what ours does: no NET before RESIGN, and, if `legacy`, LTCs in place of
+/// NETs; `done` is the last tag completed.
+fn rewrite(mut bytes: &[u8], legacy: bool, done: Option<Tag>) -> Vec<u8> {
+    let mut rewritten = Vec::new();
+    while let Ok(Some((message, length))) = ToRti::decode(bytes) {
+        bytes = &bytes[length..];
+        match message {
+            ToRti::NextEventTag(Tag::FOREVER) if bytes.first() == Some(&kind::RESIGN) => {}
+            ToRti::NextEventTag(next) if legacy && next != Tag::FOREVER => {
+                if let Some(done) = done.filter(|done| *done < next) {
+                    ToRti::LatestTagConfirmed(done).encode(&mut rewritten);
+                }
+            }
+            message => message.encode(&mut rewritten),
+        }
+    }
+    rewritten
 }

@@ -17,6 +17,7 @@ pub(super) struct RtiHost {
     peers: Vec<Peer>,
     dead: bool,
     wake_at: Option<i64>,
+    calm: bool,
 }
 
 #[derive(Debug, Default)]
@@ -44,6 +45,7 @@ impl RtiHost {
             peers: std::iter::repeat_with(Peer::default).take(federates).collect(),
             dead: false,
             wake_at: None,
+            calm: conditions.swarm.mode.calm,
         }
     }
 
@@ -94,6 +96,7 @@ impl RtiHost {
     /// How long the RTI takes to look at what has arrived: more may arrive meanwhile.
     pub(super) fn dawdle(&mut self) -> i64 {
         let most = *self.rng.pick(&[0, 0, 5_000, 300_000]);
+        let most = if self.calm { 0 } else { most };
         self.rng.span(Duration::ZERO, Duration::from_nanos(most)).as_nanos()
     }
 }
