@@ -144,7 +144,9 @@ fn legacy_sources(topology: &Topology, swarm: &Swarm) -> Vec<bool> {
         topology.downstream(f).is_empty() && topology.upstream(f).iter().all(|(u, _)| source(*u))
     };
     let may = |f| source(f) && topology.downstream(f).iter().all(|(d, _)| leaf(*d));
-    let wanted = swarm.mode.legacy_sources && !swarm.shape.physical;
+    // Their kind knows neither physical actions nor flow control.
+    let ours = swarm.shape.physical || swarm.mode.max_lead.is_some();
+    let wanted = swarm.mode.legacy_sources && !ours;
     // All sources of a leaf must, or none.
     let all = |f: FederateId| {
         topology

@@ -126,10 +126,10 @@ impl Rti {
         touched.affected.clear();
         if self.config.dnet {
             for &federate in &touched.next_event.list {
+                // Its own too: a message may have lowered its NET below what it has been told is needless.
+                touched.affected.insert(federate);
                 for &(source, _) in self.topology.sources(federate) {
-                    if source != federate {
-                        touched.affected.insert(source);
-                    }
+                    touched.affected.insert(source);
                 }
             }
             for &federate in &touched.affected.list {
@@ -201,7 +201,7 @@ impl Rti {
     }
 
     fn tell_downstream_next_event(&mut self, federate: FederateId, start: Tag) {
-        if !self.is_present(federate) {
+        if !self.is_present(federate) || self.topology.sinks(federate).is_empty() {
             return;
         }
         let tag = downstream_next_event(&self.view(LostRule::Gone, start), federate);
