@@ -6,7 +6,6 @@ use std::time::Duration;
 
 use ictus_deploy::Checked;
 use ictusd::api::{Event, Happening, Outcome};
-use ictusd::client::Client;
 use ictusd::store::Directory;
 use tokio::signal::unix::{Signal, SignalKind, signal};
 
@@ -21,12 +20,13 @@ const SLACK: Duration = Duration::from_secs(60);
 #[derive(Debug)]
 pub(crate) struct Runs<'a> {
     session: &'a Session,
-    client: Client,
     checked: &'a Checked,
     limit: Duration,
     /// One for the whole command: a Ctrl-C between two waits counts, too.
     interrupts: Signal,
     names: Vec<String>,
+    /// The run that failed: its logs stay.
+    failed: Option<String>,
 }
 
 impl<'a> Runs<'a> {
@@ -44,14 +44,13 @@ impl<'a> Runs<'a> {
             return Err(CliError::new(Kind::Manifest, message).hint("add a line `timeout: 10 s`"));
         };
         let limit = Duration::from_nanos(timeout).saturating_add(SLACK);
-        let client = session.daemon().await?;
         Ok(Self {
             session,
-            client,
             checked,
             limit,
             interrupts: signal(SignalKind::interrupt()).map_err(CliError::failed)?,
             names: Vec::new(),
+            failed: None,
         })
     }
 
@@ -59,10 +58,9 @@ impl<'a> Runs<'a> {
     pub(crate) async fn federated(&mut self, trace: bool) -> Result<Directory, CliError> {
         let own = &self.checked.plan.federation;
         let name = format!("{own}.{}.{}", std::process::id(), self.names.len() + 1);
-        let mut stream = self
-            .client
-            .start(&name, &request(self.checked, trace))
-            .await?;
+        // Asked for anew each time: one that has owned nothing for long may have ended.
+        let client = self.session.daemon().await?;
+        let mut stream = client.start(&name, &request(self.checked, trace)).await?;
         self.names.push(name.clone());
         let outcome = async {
             while let Some(Happening { event, .. }) = stream.next().await? {
@@ -73,7 +71,10 @@ impl<'a> Runs<'a> {
             Err(CliError::failed("the daemon went away"))
         };
         let outcome = self.bounded(outcome).await?;
-        succeed(&name, &outcome)?;
+        if let Err(error) = succeed(&name, &outcome) {
+            self.failed = Some(name);
+            return Err(error);
+        }
         if outcome != Outcome::Completed {
             return Err(CliError::failed(format!(
                 "run `{name}` was stopped from outside"
@@ -137,15 +138,20 @@ impl<'a> Runs<'a> {
         Err(CliError::failed(message))
     }
 
-    /// Removes what the runs left and lets the daemon end if it has nothing else to do.
+    /// Removes what the runs left, the logs of a failed one apart, and lets the daemon end if it has nothing else to do.
     pub(crate) async fn remove(self, ui: &mut Ui) {
+        let client = match self.session.daemon().await {
+            Ok(client) => client,
+            Err(error) => return ui.warning(&format!("runs were not removed: {error}")),
+        };
         for name in &self.names {
-            if let Err(error) = self.client.remove(name, true).await {
+            let purge = self.failed.as_ref() != Some(name);
+            if let Err(error) = client.remove(name, purge).await {
                 ui.warning(&format!("run `{name}` was not removed: {error}"));
             }
         }
         // It ends by itself otherwise.
-        self.client.end().await.ok();
+        client.end().await.ok();
     }
 
     async fn bounded<T>(

@@ -104,6 +104,7 @@ pub(crate) fn checked(ui: &mut Ui, args: &ManifestArgs, build: bool) -> Result<C
         ..CheckOptions::default()
     };
     let start = Instant::now();
+    let mut built = Vec::new();
     let checked = check(&path, &options, &mut |progress| match progress {
         Progress::Building { program } => ui.progress("building", &program),
         Progress::Compiled { program, package } => {
@@ -114,10 +115,9 @@ pub(crate) fn checked(ui: &mut Ui, args: &ManifestArgs, build: bool) -> Result<C
             executable,
         } => {
             let took = start.elapsed().as_secs_f64();
-            ui.stage(
-                "built",
-                &format!("{program} in {took:.1} s: {}", executable.display()),
-            );
+            let built_now = format!("{program} in {took:.1} s: {}", executable.display());
+            ui.progress("built", &built_now);
+            built.push(built_now);
         }
         Progress::Described { program, federates } => {
             ui.progress("checking", &format!("{program}: {federates} federates"));
@@ -138,6 +138,9 @@ pub(crate) fn checked(ui: &mut Ui, args: &ManifestArgs, build: bool) -> Result<C
         "checked",
         &format!("{}: {what}, {how}{without}", path.display()),
     );
+    for built in &built {
+        ui.stage("built", built);
+    }
     Ok(checked)
 }
 

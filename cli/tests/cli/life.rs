@@ -63,13 +63,8 @@ fn up_ps_logs_stop_down_purge() {
         .filter_map(|line| line.split(' ').next())
         .collect();
     let expected = [
-        "built", "checked", "started", "started", "joined", "agreed", "running", "healthy",
+        "checked", "built", "started", "started", "joined", "agreed", "running", "healthy",
     ];
-    // A program that is a file needs no building.
-    let expected: Vec<_> = expected
-        .into_iter()
-        .filter(|stage| *stage != "built" || stages.contains(stage))
-        .collect();
     assert_eq!(stages, expected, "{up}");
     assert!(up.out.contains("pair runs: 2 federates"), "{up}");
 
@@ -250,6 +245,37 @@ fn verify_finds_equal_traces_and_different_ones() {
             .starts_with("[]"),
         "no run is left"
     );
+}
+
+#[test]
+fn verify_outlives_a_daemon_that_had_nothing_to_do() {
+    let environment = pair();
+    environment.write("equal.yaml", &format!("{PAIR}timeout: 3 s\n"));
+    let mut command = environment.command(&["verify", "equal.yaml"]);
+    // The run in one process takes longer.
+    let said = command
+        .env("ICTUS_DAEMON_IDLE_MS", "1500")
+        .output()
+        .unwrap();
+    assert!(
+        said.status.success(),
+        "{}",
+        String::from_utf8_lossy(&said.stderr)
+    );
+}
+
+#[test]
+fn a_run_that_fails_under_verify_leaves_its_logs() {
+    let environment = pair();
+    let text = PAIR.replace(
+        "class: Sink",
+        "class: Sink, env: { FIXTURE: exit-federated }",
+    );
+    environment.write("bad.yaml", &with_timeout(&text));
+    let verify = environment.run(&["verify", "bad.yaml"]);
+    assert_eq!(verify.code, 1, "{verify}");
+    let (_, log) = verify.err.rsplit_once("the whole log is HOME/").unwrap();
+    assert!(environment.path(log.trim_end()).is_file(), "{verify}");
 }
 
 #[test]
