@@ -124,11 +124,7 @@ impl Up {
 impl Begun {
     /// Reports stages until it is healthy, or will not be.
     async fn wait(&mut self, ui: &mut Ui, limit: Duration, of: usize) -> Result<Start, CliError> {
-        let mut stages = Stages {
-            all_started: false,
-            joined: 0,
-            of,
-        };
+        let mut stages = Stages::new(of);
         let deadline = tokio::time::sleep(limit);
         tokio::pin!(deadline);
         loop {
@@ -233,33 +229,52 @@ fn refused(error: ClientError, name: &str) -> CliError {
     error
 }
 
-/// What has been reported.
+/// How far everybody is. Members are heard independently of each other; the stages are said in order all the same.
+#[derive(Debug)]
 struct Stages {
-    all_started: bool,
-    joined: usize,
     of: usize,
+    /// The first stage that is not reached.
+    at: Stage,
+    port: Option<u16>,
+    started: usize,
+    joined: usize,
+    start_ns: Option<i64>,
+    /// Federates that have completed their first tag, of those that say so.
+    running: (usize, usize),
+}
+
+#[derive(Clone, Copy, Debug)]
+enum Stage {
+    Listening,
+    Started,
+    Joined,
+    Agreed,
+    Running,
+    Done,
 }
 
 impl Stages {
+    fn new(of: usize) -> Self {
+        let (port, start_ns) = (None, None);
+        Self {
+            of,
+            at: Stage::Listening,
+            port,
+            started: 0,
+            joined: 0,
+            start_ns,
+            running: (0, of),
+        }
+    }
+
     fn report(&mut self, ui: &mut Ui, event: &Event) {
         match event {
             Event::Started { member, .. } if member == "rti" => {}
-            Event::Started { started, of, .. } => self.started(ui, *started, *of),
-            Event::Listening { port } => {
-                ui.stage(
-                    "started",
-                    &format!("the RTI, listening on 127.0.0.1:{port}"),
-                );
-            }
-            Event::Joined { joined, of, .. } => {
-                self.joined = *joined;
-                if joined == of {
-                    self.started(ui, *of, *of);
-                }
-                counted(ui, "joined", *joined, *of);
-            }
-            Event::StartTag { start_ns } => ui.stage("agreed", &start_tag(*start_ns)),
-            Event::Running { running, of, .. } => counted(ui, "running", *running, *of),
+            Event::Started { started, .. } => self.started = *started,
+            Event::Listening { port } => self.port = Some(*port),
+            Event::Joined { joined, .. } => self.joined = *joined,
+            Event::StartTag { start_ns } => self.start_ns = Some(*start_ns),
+            Event::Running { running, of, .. } => self.running = (*running, *of),
             Event::Healthy | Event::Ended { .. } => {}
             // A refused stranger or a federate that ended: said now, decided by the daemon.
             Event::Rejected { .. }
@@ -269,34 +284,54 @@ impl Stages {
             | Event::Lost { .. }
             | Event::Exited { .. }
             | Event::Signalled { .. }
-            | Event::Foreign { .. } => {
-                let (said, Self { joined, of, .. }) = (describe(event), self);
-                ui.stage("", &format!("{said} (joined {joined}/{of})"));
+            | Event::Foreign { .. } => ui.stage("", &describe(event)),
+        }
+        while self.advance(ui) {}
+    }
+
+    /// Says the first stage that is not reached, or that it is; true when another may be.
+    fn advance(&mut self, ui: &mut Ui) -> bool {
+        let (next, reached) = match self.at {
+            Stage::Listening => {
+                let Some(port) = self.port else { return false };
+                ui.stage(
+                    "started",
+                    &format!("the RTI, listening on 127.0.0.1:{port}"),
+                );
+                (Stage::Started, true)
             }
+            Stage::Started => (Stage::Joined, counted(ui, "started", self.started, self.of)),
+            Stage::Joined => (Stage::Agreed, counted(ui, "joined", self.joined, self.of)),
+            Stage::Agreed => {
+                let Some(start_ns) = self.start_ns else {
+                    return false;
+                };
+                ui.stage(
+                    "agreed",
+                    &format!("on the start tag {}", stamp::text(start_ns)),
+                );
+                (Stage::Running, true)
+            }
+            Stage::Running => {
+                let (running, of) = self.running;
+                (Stage::Done, counted(ui, "running", running, of))
+            }
+            Stage::Done => return false,
+        };
+        if reached {
+            self.at = next;
         }
+        reached
     }
 }
 
-impl Stages {
-    /// The RTI may hear from a federate before its supervisor is heard: started comes before joined all the same.
-    fn started(&mut self, ui: &mut Ui, started: usize, of: usize) {
-        if !self.all_started {
-            self.all_started = started == of;
-            counted(ui, "started", started, of);
-        }
-    }
-}
-
-/// A stage that is reached when everybody has reached it.
-fn counted(ui: &mut Ui, stage: &str, reached: usize, of: usize) {
+/// A stage that is reached when everybody has reached it; tells whether it is.
+fn counted(ui: &mut Ui, stage: &str, reached: usize, of: usize) -> bool {
     let detail = format!("{reached}/{of} federates");
     if reached < of {
         ui.progress(stage, &detail);
     } else {
         ui.stage(stage, &detail);
     }
-}
-
-fn start_tag(start_ns: i64) -> String {
-    format!("on the start tag {}", stamp::text(start_ns))
+    reached >= of
 }
