@@ -345,6 +345,7 @@ impl Federate {
             // Ordinary messages may still come up to the limit: it must be passed as any tag.
             if let Some(gate) = self.stop.gate() {
                 self.permit(now, gate.min(self.timeline.stop_tag()))?;
+                self.wait_until_due(now, self.timeline.stop_tag())?;
             }
             self.timeline.begin_shutdown_only(&mut self.present);
         } else {
@@ -383,8 +384,7 @@ impl Federate {
                     if !self.config.fast
                         && !link.config.mutants.has(Mutant::PhysicalPromiseDropped) =>
                 {
-                    now
-                    .saturating_add(delay)
+                    now.saturating_add(delay)
                         .max(self.timeline.start_tag().time.as_physical())
                 }
                 Some(_) | None => PhysicalTime::FOREVER,
@@ -399,11 +399,17 @@ impl Federate {
         if next == Tag::FOREVER {
             return self.starve().ok_or(Poll::Wait(None));
         }
-        let due = next.time.as_physical();
+        self.wait_until_due(now, next)?;
+        Ok(next)
+    }
+
+    #[inline]
+    fn wait_until_due(&self, now: PhysicalTime, tag: Tag) -> Result<(), Poll> {
+        let due = tag.time.as_physical();
         if !self.config.fast && now < due {
             return Err(Poll::Wait(Some(due)));
         }
-        Ok(next)
+        Ok(())
     }
 
     /// Nothing is left and nothing can come: the stop tag is the next microstep, unless told to keep alive.
@@ -414,6 +420,9 @@ impl Federate {
             return None;
         }
         self.timeline.stop_at(self.timeline.at().successor());
+        if let Some(link) = &mut self.link {
+            link.fall_silent();
+        }
         Some(self.timeline.stop_tag())
     }
 

@@ -404,6 +404,14 @@ impl Timeline {
         }
     }
 
+    /// Unlearns the status of all inputs after `through`: a stop was agreed, at which others may write what they had not
+    /// announced. `through` is at or after the current tag.
+    pub fn unsettle_after(&mut self, through: Tag) {
+        for status in &mut self.state.inputs {
+            status.known = status.known.min(through);
+        }
+    }
+
     /// Learns that the status of `input` is known up to and including `through`.
     pub fn settle(&mut self, input: InputId, through: Tag) {
         self.state.learn(input, through);
@@ -623,7 +631,11 @@ impl ReadyLists {
         for node in list.iter() {
             self.marked[node.index()] = false;
         }
-        batch.append(list);
+        if batch.is_empty() {
+            std::mem::swap(batch, list);
+        } else {
+            batch.append(list);
+        }
     }
 
     fn take_if(&mut self, batch: &mut Vec<NodeId>, free: impl Fn(NodeId) -> bool) {

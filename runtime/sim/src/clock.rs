@@ -42,7 +42,9 @@ impl HostClock {
     /// The first true time at which the clock shows `reading` or more; `None` when that is out of range.
     #[must_use]
     pub fn when(&self, reading: PhysicalTime) -> Option<i64> {
-        let shown = reading.as_nanos().checked_sub(EPOCH + self.offset + self.correction)?;
+        let shown = reading
+            .as_nanos()
+            .checked_sub(EPOCH + self.offset + self.correction)?;
         let exact = i128::from(shown) * MILLION / (MILLION + i128::from(self.drift_ppm));
         let mut true_time = i64::try_from(exact).ok()?.checked_sub(2)?;
         while self.reading(true_time) < reading {

@@ -172,10 +172,15 @@ impl SyntheticExecutor {
     fn react(&mut self, node: NodeId, effects: &mut Effects) {
         let body = &self.assembly.bodies[node.index()];
         let (read, hops) = self.read(body);
-        let hops = if self.tag == self.start { hops.max(2) } else { hops };
         let time = self.tag.time - self.start.time;
-        let at = mix(time.as_nanos().cast_unsigned(), u64::from(self.tag.microstep));
-        let state = mix(self.states[body.state], mix(at, mix(read, u64::from(body.name.1))));
+        let at = mix(
+            time.as_nanos().cast_unsigned(),
+            u64::from(self.tag.microstep),
+        );
+        let state = mix(
+            self.states[body.state],
+            mix(at, mix(read, u64::from(body.name.1))),
+        );
         let mut digest = 0;
         let mut set = Vec::new();
         if hops > 0 {
@@ -216,7 +221,11 @@ impl SyntheticExecutor {
         }
         for (action, delay, value) in scheduled {
             let value = self.hold(value);
-            effects.scheduled.push(Scheduled { action, delay, value });
+            effects.scheduled.push(Scheduled {
+                action,
+                delay,
+                value,
+            });
         }
     }
 
@@ -303,7 +312,9 @@ impl FederateExecutor for SyntheticExecutor {
     }
 
     fn decode(&mut self, input: InputId, payload: &[u8]) -> Result<ValueId, PayloadError> {
-        let bytes = payload.first_chunk().filter(|_| payload.len() == 8 + self.payload);
+        let bytes = payload
+            .first_chunk()
+            .filter(|_| payload.len() == 8 + self.payload);
         let Some(bytes) = bytes else {
             let program = &self.assembly.program;
             return Err(PayloadError {

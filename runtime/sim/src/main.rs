@@ -32,7 +32,10 @@ fn main() -> ExitCode {
             Ok(false) | Err(_) => ExitCode::FAILURE,
         },
         Err(words) => {
-            let _ = writeln!(io::stderr(), "{words}\nusage: cargo sim -- [--seeds N] [--from N] [--seed 0xN]... [--dump] [--mutants]");
+            let _ = writeln!(
+                io::stderr(),
+                "{words}\nusage: cargo sim -- [--seeds N] [--from N] [--seed 0xN]... [--dump] [--mutants]"
+            );
             ExitCode::from(2)
         }
     }
@@ -78,7 +81,11 @@ fn run(options: &Options, out: &mut impl Write) -> io::Result<bool> {
         let (verdict, violation) = check(*seed, Mutants::NONE, options.dump);
         if let Some(verdict) = verdict {
             write!(out, "{}", verdict.log.as_deref().unwrap_or_default())?;
-            writeln!(out, "seed {seed:#x}: {:?}\n{} tags, hash {:x}", verdict.swarm, verdict.tags, verdict.hash)?;
+            writeln!(
+                out,
+                "seed {seed:#x}: {:?}\n{} tags, hash {:x}",
+                verdict.swarm, verdict.tags, verdict.hash
+            )?;
             write!(out, "{}", verdict.coverage.table())?;
         }
         if let Some(violation) = violation {
@@ -128,10 +135,13 @@ impl Tally {
         if let Some(violation) = violation {
             let options = verdict.as_ref().map(|v| format!("{:?}", v.swarm));
             let options = options.unwrap_or_default();
-            self.failures.push((seed, format!("{violation}\n  options: {options}")));
+            self.failures
+                .push((seed, format!("{violation}\n  options: {options}")));
         }
         let Some(verdict) = verdict else { return };
-        if seed.is_multiple_of(TWICE) && check_seed_logged(seed, Mutants::NONE, false).hash != verdict.hash {
+        if seed.is_multiple_of(TWICE)
+            && check_seed_logged(seed, Mutants::NONE, false).hash != verdict.hash
+        {
             let what = "the same seed gave two different runs".to_owned();
             self.failures.push((seed, what));
         }
@@ -187,7 +197,10 @@ fn report(total: &mut Tally, out: &mut impl Write) -> io::Result<bool> {
         out,
         "{} seeds: median {} federates, {} tags; {} failed",
         total.tags.len(),
-        total.federates.get(median(total.federates.len())).unwrap_or(&0),
+        total
+            .federates
+            .get(median(total.federates.len()))
+            .unwrap_or(&0),
         total.tags.get(median(total.tags.len())).unwrap_or(&0),
         total.failures.len()
     )?;

@@ -9,7 +9,11 @@ use std::sync::atomic::{AtomicU64, Ordering};
 const SEEDS: u64 = 2_000;
 
 pub(super) fn run(options: &Options, out: &mut impl Write) -> io::Result<bool> {
-    let seeds = if options.seeds == 0 { SEEDS } else { options.seeds };
+    let seeds = if options.seeds == 0 {
+        SEEDS
+    } else {
+        options.seeds
+    };
     let quiet = std::panic::take_hook();
     std::panic::set_hook(Box::new(|_| {}));
     let next = AtomicU64::new(0);
@@ -19,9 +23,13 @@ pub(super) fn run(options: &Options, out: &mut impl Write) -> io::Result<bool> {
             scope.spawn(|| {
                 loop {
                     let index = usize::try_from(next.fetch_add(1, Ordering::Relaxed)).unwrap_or(0);
-                    let Some(mutant) = Mutant::ALL.get(index) else { return };
+                    let Some(mutant) = Mutant::ALL.get(index) else {
+                        return;
+                    };
                     let row = hunt(*mutant, seeds);
-                    rows.lock().expect("hunters do not panic").push((index, row));
+                    rows.lock()
+                        .expect("hunters do not panic")
+                        .push((index, row));
                 }
             });
         }
@@ -29,7 +37,11 @@ pub(super) fn run(options: &Options, out: &mut impl Write) -> io::Result<bool> {
     std::panic::set_hook(quiet);
     let mut rows = rows.into_inner().expect("hunters do not panic");
     rows.sort_unstable_by_key(|row| row.0);
-    writeln!(out, "{:<26} {:>9} {:>6}  caught by", "mutant", "seed", "tried")?;
+    writeln!(
+        out,
+        "{:<26} {:>9} {:>6}  caught by",
+        "mutant", "seed", "tried"
+    )?;
     let mut caught = 0;
     for (index, row) in &rows {
         let mutant = Mutant::ALL[*index];
@@ -39,7 +51,12 @@ pub(super) fn run(options: &Options, out: &mut impl Write) -> io::Result<bool> {
                 let name = format!("{mutant:?}");
                 writeln!(out, "{name:<26} {seed:>#9x} {seed:>6}  {words}")?;
             }
-            None => writeln!(out, "{:<26} {:>9} {seeds:>6}  -", format!("{mutant:?}"), "-")?,
+            None => writeln!(
+                out,
+                "{:<26} {:>9} {seeds:>6}  -",
+                format!("{mutant:?}"),
+                "-"
+            )?,
         }
     }
     writeln!(out, "{caught} of {} mutants caught", rows.len())?;

@@ -96,7 +96,9 @@ impl Pipe {
     }
 
     fn enqueue(&mut self, now: i64, arrival: Arrival, wake: &mut Vec<i64>) {
-        let mut delay = self.rng.span(self.network.delay_min, self.network.delay_max);
+        let mut delay = self
+            .rng
+            .span(self.network.delay_min, self.network.delay_max);
         if self.rng.percent(self.network.clog) {
             let worst = Duration::from_nanos(self.network.delay_max.as_nanos() * 20);
             delay = self.rng.span(self.network.delay_max, worst);

@@ -28,6 +28,8 @@ pub struct Position {
     pub next: Tag,
     /// The stop tag.
     pub stop: Tag,
+    /// Whether nothing will ever happen there again.
+    pub over: bool,
 }
 
 impl Position {
@@ -37,6 +39,7 @@ impl Position {
         executing: false,
         next: Tag::NEVER,
         stop: Tag::FOREVER,
+        over: false,
     };
 }
 
@@ -76,6 +79,8 @@ pub struct Observer {
     pub now: i64,
     /// Whether events come from outside.
     pub physical: bool,
+    /// Whether federates and RTI use our extensions.
+    pub extensions: bool,
     /// What has happened so far.
     pub coverage: Coverage,
 }
@@ -98,6 +103,7 @@ impl Observer {
             log: None,
             now: 0,
             physical: false,
+            extensions: true,
             coverage: Coverage::default(),
         }
     }
@@ -112,6 +118,12 @@ impl Observer {
     #[must_use]
     pub fn start(&self) -> Option<Tag> {
         self.start
+    }
+
+    /// The immediate upstreams of a federate.
+    pub fn upstream(&self, federate: usize) -> impl Iterator<Item = usize> {
+        let upstream = self.topology.upstream(FederateId::from_index(federate));
+        upstream.iter().map(|(upstream, _)| upstream.index())
     }
 
     /// The last tag at which a federate may run ordinary reactions, if another was lost.
@@ -250,7 +262,15 @@ impl Observer {
                 self.coverage.hit(Feature::DownstreamNextEvent);
                 self.needless_announcements(to, *tag, truth);
             }
-            ToFederate::StopGranted(_) => self.stop_granted = true,
+            ToFederate::StopGranted(tag) => {
+                self.stop_granted = true;
+                if self.extensions {
+                    let seen = &mut self.seen[to];
+                    let before = tag.latest_earlier();
+                    seen.granted = seen.granted.map(|g| g.min(before));
+                    seen.provisional = seen.provisional.map(|g| g.min(before));
+                }
+            }
             ToFederate::FederateLost { promise, .. } => {
                 if *promise != Tag::FOREVER {
                     self.coverage.hit(Feature::PromiseLimit);
@@ -278,7 +298,10 @@ impl Observer {
         self.coverage.hit(Feature::FullGrant);
         let seen = &self.seen[to];
         if seen.granted.is_some_and(|g| tag <= g) || seen.provisional.is_some_and(|p| tag < p) {
-            let what = format!("TAG{tag} to {to} after TAG{:?}, PTAG{:?}", seen.granted, seen.provisional);
+            let what = format!(
+                "TAG{tag} to {to} after TAG{:?}, PTAG{:?}",
+                seen.granted, seen.provisional
+            );
             self.blame("safety", what);
         }
         self.seen[to].granted = Some(tag);
@@ -288,7 +311,10 @@ impl Observer {
         let earliest = self.earliest_incoming(to, truth);
         let unrelayed = self.first_unrelayed(to);
         if tag >= earliest.min(unrelayed) && tag < truth[to].stop {
-            let what = format!("TAG{tag} to {to}, but a message may still come with {}", earliest.min(unrelayed));
+            let what = format!(
+                "TAG{tag} to {to}, but a message may still come with {}",
+                earliest.min(unrelayed)
+            );
             self.blame("grant oracle", what);
         }
     }
@@ -297,7 +323,10 @@ impl Observer {
         self.coverage.hit(Feature::ProvisionalGrant);
         let seen = &self.seen[to];
         if seen.granted.max(seen.provisional).is_some_and(|g| tag <= g) {
-            let what = format!("PTAG{tag} to {to} after TAG{:?}, PTAG{:?}", seen.granted, seen.provisional);
+            let what = format!(
+                "PTAG{tag} to {to} after TAG{:?}, PTAG{:?}",
+                seen.granted, seen.provisional
+            );
             self.blame("safety", what);
         }
         self.seen[to].provisional = Some(tag);
@@ -305,7 +334,9 @@ impl Observer {
             return;
         }
         let outside = self.earliest_from_outside(to, truth);
-        let earliest = self.earliest_incoming(to, truth).min(self.first_unrelayed(to));
+        let earliest = self
+            .earliest_incoming(to, truth)
+            .min(self.first_unrelayed(to));
         if tag > earliest || tag >= outside {
             let what = format!(
                 "PTAG{tag} to {to}, but a message may come with {earliest}, from outside its cycle with {outside}"
@@ -346,7 +377,9 @@ impl Observer {
     fn activities(&self, truth: &[Position]) -> Vec<Tag> {
         let start = self.start.unwrap_or(Tag::NEVER);
         let floor = |position: &Position| {
-            let floor = if position.executing {
+            let floor = if position.over {
+                Tag::FOREVER
+            } else if position.executing {
                 position.at
             } else {
                 position.at.successor()
@@ -387,7 +420,9 @@ impl Observer {
     }
 
     fn earliest_incoming(&self, to: usize, truth: &[Position]) -> Tag {
-        self.incoming(FederateId::from_index(to), &self.activities(truth), |_| true)
+        self.incoming(FederateId::from_index(to), &self.activities(truth), |_| {
+            true
+        })
     }
 
     fn earliest_from_outside(&self, to: usize, truth: &[Position]) -> Tag {
@@ -433,7 +468,10 @@ impl Observer {
         let granted = seen.granted.max(seen.provisional).unwrap_or(Tag::NEVER);
         let shutdown_only = self.lost && position.at >= position.stop;
         if position.at > granted && !shutdown_only {
-            let what = format!("federate {federate} ran {} but was granted {granted}", position.at);
+            let what = format!(
+                "federate {federate} ran {} but was granted {granted}",
+                position.at
+            );
             self.blame("safety", what);
         }
     }

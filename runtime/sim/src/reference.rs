@@ -35,7 +35,9 @@ pub fn reference(
     events: &[OutsideEvent],
     stop: Option<(Duration, u32)>,
 ) -> Vec<Record> {
-    let assembly = federation.alone().expect("generated federations have no loop");
+    let assembly = federation
+        .alone()
+        .expect("generated federations have no loop");
     let program = Arc::clone(&assembly.program);
     let physical = assembly.physical.clone();
     let mut executor = SyntheticExecutor::new(assembly, 0);

@@ -27,7 +27,7 @@ pub struct Verdict {
     pub tags: u64,
     /// Equal for equal runs.
     pub hash: u64,
-    /// Every message of the first run, if asked for.
+    /// Every message of one run, if asked for.
     pub log: Option<String>,
 }
 
@@ -37,7 +37,7 @@ pub fn check_seed(seed: u64, mutants: Mutants) -> Verdict {
     check_seed_logged(seed, mutants, false)
 }
 
-/// Checks one seed and keeps a log of its first run if asked to.
+/// Checks one seed and, if asked to, keeps a log of the run that broke a law, or else of the first.
 #[must_use]
 pub fn check_seed_logged(seed: u64, mutants: Mutants, log: bool) -> Verdict {
     let mut rng = Rng::new(seed);
@@ -59,13 +59,16 @@ pub fn check_seed_logged(seed: u64, mutants: Mutants, log: bool) -> Verdict {
     verdict.violation = judge(&federation, &verdict.swarm, &first).err();
     if verdict.violation.is_none() && seed.is_multiple_of(4) {
         // Another network and other batches: the same laws, the same reference.
-        let second = simulate(&federation, &verdict.swarm, mutants, &rng.fork(2), false);
+        let mut second = simulate(&federation, &verdict.swarm, mutants, &rng.fork(2), log);
         verdict.hash = mix(verdict.hash, hash(&second));
         verdict.violation = second
             .violation()
             .cloned()
             .or_else(|| judge(&federation, &verdict.swarm, &second).err());
         verdict.coverage.merge(&second.observer.coverage);
+        if verdict.violation.is_some() {
+            verdict.log = second.observer.log.take();
+        }
     }
     verdict
 }
@@ -122,6 +125,7 @@ pub fn simulate(
     let mut observer = Observer::new(topology, delays);
     observer.log = log.then(String::new);
     observer.physical = swarm.shape.physical;
+    observer.extensions = swarm.mode.extensions;
     World::new(members.collect(), observer, conditions, rng).run()
 }
 
@@ -154,7 +158,10 @@ fn legacy_sources(topology: &Topology, swarm: &Swarm) -> Vec<bool> {
             .iter()
             .all(|(d, _)| topology.upstream(*d).iter().all(|(u, _)| may(*u)))
     };
-    topology.federates().map(|f| wanted && may(f) && all(f)).collect()
+    topology
+        .federates()
+        .map(|f| wanted && may(f) && all(f))
+        .collect()
 }
 
 /// The checkers that look at a run when it is over.
@@ -179,10 +186,7 @@ fn judge(
     Ok(())
 }
 
-fn check_outcomes(
-    extensions: bool,
-    run: &Run<SyntheticExecutor>,
-) -> Result<(), Violation> {
+fn check_outcomes(extensions: bool, run: &Run<SyntheticExecutor>) -> Result<(), Violation> {
     for (index, member) in run.members.iter().enumerate() {
         let right = match (&member.outcome, run.victim) {
             (None, Some(Victim::Federate(victim))) => victim == index,
@@ -218,7 +222,9 @@ fn check_trace(
     swarm: &Swarm,
     run: &Run<SyntheticExecutor>,
 ) -> Result<(), Violation> {
-    let Some(start) = run.start else { return Ok(()) };
+    let Some(start) = run.start else {
+        return Ok(());
+    };
     let events: Vec<OutsideEvent> = run
         .members
         .iter()
@@ -241,7 +247,10 @@ fn check_trace(
         check_limit(index, &limit, &actual, &expected, start)?;
         let wanted = expected.iter().filter(mine);
         let wanted: Vec<Record> = wanted.filter(|r| limit.covers(r, start)).copied().collect();
-        let got: Vec<Record> = actual.into_iter().filter(|r| limit.covers(r, start)).collect();
+        let got: Vec<Record> = actual
+            .into_iter()
+            .filter(|r| limit.covers(r, start))
+            .collect();
         compare(federation, index, &wanted, &got)?;
     }
     Ok(())
@@ -255,9 +264,14 @@ fn common_stop(run: &Run<SyntheticExecutor>, start: Tag) -> Option<(Duration, u3
 }
 
 /// The federates that did not die.
-fn survivors(run: &Run<SyntheticExecutor>) -> impl Iterator<Item = (usize, &Ended<SyntheticExecutor>)> {
+fn survivors(
+    run: &Run<SyntheticExecutor>,
+) -> impl Iterator<Item = (usize, &Ended<SyntheticExecutor>)> {
     let died = move |index: usize| run.victim == Some(Victim::Federate(index));
-    run.members.iter().enumerate().filter(move |(index, _)| !died(*index))
+    run.members
+        .iter()
+        .enumerate()
+        .filter(move |(index, _)| !died(*index))
 }
 
 /// All who take part in a stop stop at the same tag; others have ended at the time-out before it was agreed.
@@ -276,7 +290,9 @@ fn check_stops(
     let stops = survivors(run).filter(|(_, m)| m.stop != Tag::FOREVER && m.stop != end);
     let stops = stops.filter(|(_, m)| !matches!(m.outcome, Some(Outcome::RtiFailed)));
     let mut stops = stops.map(|(index, m)| (index, m.stop));
-    let Some((first, stop)) = stops.next() else { return Ok(()) };
+    let Some((first, stop)) = stops.next() else {
+        return Ok(());
+    };
     match stops.find(|(_, other)| *other != stop) {
         Some((second, other)) => Err(Violation {
             checker: "stop",
@@ -324,6 +340,8 @@ impl Limit {
             Some(Victim::Rti) if at >= stop => before_stop.latest_earlier(),
             Some(Victim::Rti) => at.latest_earlier(),
             None if swarm.ending == Ending::Starvation => before_stop,
+            // Without our extensions, what is written at an agreed stop tag may stay where it is.
+            None if !swarm.mode.extensions => before_stop,
             // Others ended later, and ran no shutdown at this one's stop tag.
             None if survivors(run).any(|(_, m)| m.stop > stop) => before_stop,
             None => stop,
@@ -349,7 +367,9 @@ fn check_limit(
     expected: &[Record],
     start: Tag,
 ) -> Result<(), Violation> {
-    let Some(promise) = limit.promise else { return Ok(()) };
+    let Some(promise) = limit.promise else {
+        return Ok(());
+    };
     let (promise, stop) = (since(promise, start), since(limit.stop, start));
     let tag = |r: &Record| (r.time, r.microstep);
     let mut past = records.iter().filter(|r| tag(r) > promise && tag(r) < stop);
@@ -376,7 +396,10 @@ fn compare(
     let name = |record: Option<&Record>| {
         record.map_or("nothing".to_owned(), |r| {
             let path = federation.paths().nth(r.reactor as usize).unwrap_or("?");
-            format!("{path}#{} at {}+{} ({:x})", r.reaction, r.time, r.microstep, r.effects)
+            format!(
+                "{path}#{} at {}+{} ({:x})",
+                r.reaction, r.time, r.microstep, r.effects
+            )
         })
     };
     Err(Violation {
@@ -393,7 +416,10 @@ fn hash(run: &Run<SyntheticExecutor>) -> u64 {
     let mut hash = run.duration.as_nanos().cast_unsigned();
     for member in &run.members {
         for record in member.executor.trace() {
-            let tag = mix(record.time.as_nanos().cast_unsigned(), u64::from(record.microstep));
+            let tag = mix(
+                record.time.as_nanos().cast_unsigned(),
+                u64::from(record.microstep),
+            );
             hash = mix(hash, mix(tag, record.effects));
         }
     }
@@ -423,7 +449,10 @@ fn cover_structure(federation: &Federation, coverage: &mut Coverage, swarm: &Swa
         ),
         (
             Feature::SelfContained,
-            federation.links.iter().any(|l| l.from.0 == l.to.0 && l.delay != Delay::None),
+            federation
+                .links
+                .iter()
+                .any(|l| l.from.0 == l.to.0 && l.delay != Delay::None),
         ),
         (
             Feature::Alone,
@@ -440,7 +469,10 @@ fn cover_structure(federation: &Federation, coverage: &mut Coverage, swarm: &Swa
                 .zip(&ids)
                 .any(|(legacy, id)| *legacy && !topology.downstream(*id).is_empty()),
         ),
-        (Feature::StopByReaction, swarm.ending == Ending::ReactionStop),
+        (
+            Feature::StopByReaction,
+            swarm.ending == Ending::ReactionStop,
+        ),
         (Feature::Starvation, swarm.ending == Ending::Starvation),
     ];
     for (feature, hit) in hits {

@@ -66,7 +66,9 @@ impl Rng {
 /// Mixes two numbers into one that depends on every bit of both, and on their order.
 #[must_use]
 pub const fn mix(a: u64, b: u64) -> u64 {
-    scramble(scramble(a ^ 0x51_7c_c1_b7_27_22_0a_95).wrapping_add(b.wrapping_mul(0x9e37_79b9_7f4a_7c15)))
+    scramble(
+        scramble(a ^ 0x51_7c_c1_b7_27_22_0a_95).wrapping_add(b.wrapping_mul(0x9e37_79b9_7f4a_7c15)),
+    )
 }
 
 const fn scramble(mut z: u64) -> u64 {

@@ -22,7 +22,10 @@ pub struct Swarm {
 
 /// How the program looks.
 #[derive(Clone, Copy, Debug)]
-#[expect(clippy::struct_excessive_bools, reason = "features are drawn independently")]
+#[expect(
+    clippy::struct_excessive_bools,
+    reason = "features are drawn independently"
+)]
 pub struct Shape {
     /// Connections that close cycles.
     pub cycles: bool,
@@ -38,7 +41,10 @@ pub struct Shape {
 
 /// How the run is driven.
 #[derive(Clone, Copy, Debug)]
-#[expect(clippy::struct_excessive_bools, reason = "features are drawn independently")]
+#[expect(
+    clippy::struct_excessive_bools,
+    reason = "features are drawn independently"
+)]
 pub struct Mode {
     /// Ahead of physical time.
     pub fast: bool,
@@ -131,7 +137,11 @@ impl Swarm {
                 drift: *rng.pick(&[0, 50, 500]),
             },
         };
-        if rng.percent(12) { swarm.calmed() } else { swarm }
+        if rng.percent(12) {
+            swarm.calmed()
+        } else {
+            swarm
+        }
     }
 
     /// Without anything that takes time, and without cycles.
@@ -142,7 +152,9 @@ impl Swarm {
         self.mode.fast = false;
         self.mode.reaction = Duration::ZERO;
         self.mode.max_lead = None;
-        self.mode.legacy_sources = false;
+        if self.mode.legacy_sources {
+            self.federates = 2 + self.federates % 2;
+        }
         self.mode.calm = true;
         self.ending = Ending::Timeout;
         self.network = Network {
@@ -197,7 +209,11 @@ fn draw_network(rng: &mut Rng) -> Network {
         delay_max: delay_min + jitter,
         cut: *rng.pick(&[0, 20, 80]),
         clog: *rng.pick(&[0, 0, 2]),
-        partitions: if rng.percent(25) { rng.between(1, 3) } else { 0 },
+        partitions: if rng.percent(25) {
+            rng.between(1, 3)
+        } else {
+            0
+        },
         partition: rng.span(1.ms(), 120.ms()),
     }
 }

@@ -200,9 +200,9 @@ impl<E: SimulatedExecutor> World<E> {
     }
 
     fn check_liveness(&mut self) {
-        let limit = self
-            .crashed
-            .map_or(LONGEST, |(at, _)| at + LONGEST_AFTER_CRASH + self.slowness());
+        let limit = self.crashed.map_or(LONGEST, |(at, _)| {
+            at + LONGEST_AFTER_CRASH + self.slowness()
+        });
         if self.now > limit || self.events > MOST_EVENTS {
             let stuck = self.describe_stuck();
             self.observer.blame("liveness", stuck);
@@ -224,7 +224,11 @@ impl<E: SimulatedExecutor> World<E> {
             .filter(|(_, host)| !host.is_over())
             .map(|(index, host)| format!("{index} at {:?}", host.position()))
             .collect();
-        let rti = if self.rti.is_over() { "over" } else { "not over" };
+        let rti = if self.rti.is_over() {
+            "over"
+        } else {
+            "not over"
+        };
         format!(
             "after {} events, at {} ns, not ended: {}; RTI {rti}",
             self.events,
@@ -298,7 +302,10 @@ impl<E: SimulatedExecutor> World<E> {
         let network = self.conditions.swarm.network;
         for _ in 0..network.partitions {
             let victim = self.rng.below(self.hosts.len());
-            let from = self.rng.span(Duration::ZERO, Duration::from_millis(700)).as_nanos();
+            let from = self
+                .rng
+                .span(Duration::ZERO, Duration::from_millis(700))
+                .as_nanos();
             let to = from + network.partition.as_nanos();
             let host = &mut self.hosts[victim];
             // Asymmetric now and then.
@@ -396,7 +403,9 @@ impl<E: SimulatedExecutor> World<E> {
         for federate in 0..self.hosts.len() {
             let lose = self.rng.percent(50);
             let now = self.now;
-            self.hosts[federate].down.break_off(now, lose, &mut self.wakes);
+            self.hosts[federate]
+                .down
+                .break_off(now, lose, &mut self.wakes);
             self.wake_for_arrivals(federate);
         }
     }

@@ -10,7 +10,10 @@ fn check(seeds: impl IntoIterator<Item = u64>) -> Coverage {
     for seed in seeds {
         let verdict = check_seed(seed, Mutants::NONE);
         if let Some(violation) = verdict.violation {
-            panic!("reproduce: cargo sim -- --seed {seed:#x}\n{violation}\n{:?}", verdict.swarm);
+            panic!(
+                "reproduce: cargo sim -- --seed {seed:#x}\n{violation}\n{:?}",
+                verdict.swarm
+            );
         }
         coverage.merge(&verdict.coverage);
     }
@@ -25,7 +28,10 @@ fn some_seeds_hold() {
 #[test]
 fn equal_seeds_give_equal_runs() {
     for seed in [3, 17, 29, 31, 44] {
-        let (first, second) = (check_seed(seed, Mutants::NONE), check_seed(seed, Mutants::NONE));
+        let (first, second) = (
+            check_seed(seed, Mutants::NONE),
+            check_seed(seed, Mutants::NONE),
+        );
         assert_eq!(first.hash, second.hash, "seed {seed:#x}");
     }
 }

@@ -214,6 +214,7 @@ impl Federate {
         let Some(link) = &mut self.link else {
             return Ok(());
         };
+        let limit = self.stop.limit();
         match message {
             ToFederate::TaggedMessage(message) => self.take_message(message, executor)?,
             ToFederate::PortAbsent(absent) => {
@@ -222,10 +223,10 @@ impl Federate {
                     .ok_or(ProtocolError::UnknownPort(absent.port))?;
                 self.timeline.settle(input, absent.tag);
             }
-            ToFederate::TagAdvanceGrant(tag) => link.grant(*tag, &mut self.timeline),
+            ToFederate::TagAdvanceGrant(tag) => link.grant(*tag, limit, &mut self.timeline),
             ToFederate::ProvisionalTagAdvanceGrant(tag) => {
                 self.counters.provisional += 1;
-                link.grant_provisionally(*tag, &mut self.timeline);
+                link.grant_provisionally(*tag, limit, &mut self.timeline);
             }
             ToFederate::DownstreamNextEventTag(tag) => link.announcements_not_needed(*tag),
             ToFederate::DownstreamConfirmed(tag) => link.downstream_confirmed(*tag),

@@ -156,6 +156,8 @@ pub(super) struct Link {
     held_back_count: u64,
     /// Nothing more may be sent: it was promised.
     silent: bool,
+    /// An agreed stop tag, which may come before what was promised.
+    silent_at: Option<Tag>,
 }
 
 /// A run of messages that downstreams have not confirmed, by the tags they have there.
@@ -190,6 +192,7 @@ impl Link {
             held_back: Tag::NEVER,
             held_back_count: 0,
             silent: false,
+            silent_at: None,
             config,
         }
     }
@@ -221,7 +224,10 @@ impl Link {
     /// The first provisionally granted tag that is still to be executed, FOREVER when there is none.
     pub(super) fn provisional_tag(&self, at: Tag) -> Tag {
         let ahead = |tag: &&Tag| **tag > at;
-        self.provisional.iter().find(ahead).map_or(Tag::FOREVER, |tag| *tag)
+        self.provisional
+            .iter()
+            .find(ahead)
+            .map_or(Tag::FOREVER, |tag| *tag)
     }
 
     pub(super) fn neighbors(&self) -> NeighborStructure {
@@ -325,7 +331,7 @@ impl Link {
         self.config.mutants.has(Mutant::SkippedNextForgotten)
     }
 
-    /// A message has come: the RTI counts its tag as announced if it is earlier than what was.
+    /// A message has come, or a stop was agreed: the RTI counts its tag as announced if it is earlier than what was.
     #[inline]
     pub(super) fn message_arrived(&mut self, tag: Tag) {
         if tag < self.announced {
@@ -349,14 +355,29 @@ impl Link {
         }
     }
 
-    /// Takes a TAG. A grant that goes back is ignored.
-    pub(super) fn grant(&mut self, tag: Tag, timeline: &mut Timeline) {
+    /// Takes a TAG. A grant that goes back is ignored. Inputs are known up to it, but not past `limit`: there, a lost
+    /// federate's silence says nothing.
+    pub(super) fn grant(&mut self, tag: Tag, limit: Tag, timeline: &mut Timeline) {
         if tag < self.granted {
             return;
         }
         self.granted = tag;
         self.forget_provisional(timeline.at());
-        timeline.settle_all(tag);
+        timeline.settle_all(tag.min(limit));
+    }
+
+    /// Takes back what was granted at `stop` and after, as our RTI does when a stop is agreed. LF's does not: there, what
+    /// this federate writes at the stop tag stays here if it comes before what was announced.
+    pub(super) fn revoke_from(&mut self, stop: Tag, timeline: &mut Timeline) {
+        if !self.config.extensions {
+            self.silent_at = Some(stop);
+            return;
+        }
+        let before = stop.latest_earlier();
+        self.granted = self.granted.min(before);
+        self.provisional.retain(|tag| *tag < stop);
+        timeline.unsettle_after(before);
+        self.message_arrived(stop);
     }
 
     fn forget_provisional(&mut self, at: Tag) {
@@ -366,9 +387,9 @@ impl Link {
     }
 
     /// Takes a PTAG: `tag` may be entered, but what comes over the cycle is unknown at it.
-    pub(super) fn grant_provisionally(&mut self, tag: Tag, timeline: &mut Timeline) {
+    pub(super) fn grant_provisionally(&mut self, tag: Tag, limit: Tag, timeline: &mut Timeline) {
         if self.config.mutants.has(Mutant::ProvisionalAsFull) {
-            self.grant(tag, timeline);
+            self.grant(tag, limit, timeline);
             return;
         }
         if tag < self.granted {
@@ -381,7 +402,7 @@ impl Link {
             } else {
                 tag
             };
-            timeline.settle(InputId::new(index), through);
+            timeline.settle(InputId::new(index), through.min(limit));
         }
         self.forget_provisional(timeline.at());
         if timeline.at() < tag {
@@ -439,7 +460,8 @@ impl Link {
         self.told_at[node.index()] = at;
         let link = self.config.outputs[output.index()];
         let tag = at.delayed(link.delay);
-        if self.silent || tag > timeline.stop_tag() || tag == Tag::FOREVER {
+        let silent = self.silent || (self.silent_at == Some(at) && self.announced > at);
+        if silent || tag > timeline.stop_tag() || tag == Tag::FOREVER {
             return false;
         }
         wire::encode_tagged_message(link.port_id, link.federate, tag, &mut self.out, payload);

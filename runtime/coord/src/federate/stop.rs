@@ -53,6 +53,11 @@ impl Stop {
         self.limit.map(Tag::successor)
     }
 
+    /// The last tag at which a lost federate's silence is no false absence; FOREVER when none is lost.
+    pub(super) fn limit(&self) -> Tag {
+        self.limit.unwrap_or(Tag::FOREVER)
+    }
+
     fn past_limit(&self, tag: Tag) -> bool {
         self.limit.is_some_and(|limit| tag > limit)
     }
@@ -127,11 +132,17 @@ impl Federate {
         }
     }
 
+    /// Takes STOP_GRANTED. At the stop tag others run their shutdown, which they had not announced when it was granted:
+    /// it must be granted anew.
     pub(super) fn take_stop_tag(&mut self, tag: Tag) {
+        let earlier = tag < self.timeline.stop_tag();
         self.timeline.stop_at(tag);
+        let stop = self.timeline.stop_tag();
+        if let Some(link) = self.link.as_mut().filter(|_| earlier) {
+            link.revoke_from(stop, &mut self.timeline);
+        }
         self.stop.consensus = Consensus::Granted;
-        self.events
-            .push_back(FederateEvent::StopGranted(self.timeline.stop_tag()));
+        self.events.push_back(FederateEvent::StopGranted(stop));
     }
 
     /// Takes FEDERATE_LOST: after `limit`, an absence could be a lie.

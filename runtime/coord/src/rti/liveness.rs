@@ -152,7 +152,9 @@ impl Rti {
         };
         // What was still to reach it would have made it send, whatever it had announced.
         let view = self.view(LostRule::Limits, start);
-        let next_event = view.next_event(federate).min(view.earliest_incoming(federate));
+        let next_event = view
+            .next_event(federate)
+            .min(view.earliest_incoming(federate));
         let standing = &mut self.standings[federate.index()];
         let confirmed = standing.completed.next_microstep().unwrap_or(Tag::NEVER);
         standing.next_event = next_event.max(confirmed);

@@ -146,8 +146,14 @@ impl Rti {
             .collect::<Vec<_>>()
         {
             self.send(federate, &ToFederate::StopGranted(tag));
+            let ours = self.members[federate.index()].capabilities.is_some();
             let standing = &mut self.standings[federate.index()];
             standing.next_event = tag.min(standing.next_event);
+            if ours {
+                // It waits for the stop tag to be granted anew: others run their shutdown there, unannounced.
+                standing.granted = standing.granted.min(tag.latest_earlier());
+                standing.provisional = standing.provisional.min(tag.latest_earlier());
+            }
             self.touched.next_event(federate);
         }
     }

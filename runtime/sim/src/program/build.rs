@@ -98,9 +98,7 @@ impl Federation {
                 let (from, to) = (builder.parts[0].port(from), builder.parts[0].port(to));
                 builder.connect(from, to, link.delay);
             } else if sends {
-                builder
-                    .program
-                    .network_output(builder.parts[0].port(from));
+                builder.program.network_output(builder.parts[0].port(from));
                 builder.outputs.push(index);
             } else if receives {
                 let delayed = link.delay != Delay::None;
@@ -260,10 +258,10 @@ impl Pending {
                 name: (0, 0),
                 state: 0,
                 shutdown: plan.shutdown,
-                actions: plan
-                    .actions
-                    .iter()
-                    .map(|a| (actions[*a], salt(1, *a)))
+                actions: [(plan.startup, ActionId::STARTUP), (plan.shutdown, ActionId::SHUTDOWN)]
+                    .into_iter()
+                    .filter_map(|(is, action)| is.then_some((action, salt(4, action.index()))))
+                    .chain(plan.actions.iter().map(|a| (actions[*a], salt(1, *a))))
                     .collect(),
                 reads: Vec::new(),
                 effects: Vec::new(),

@@ -1,6 +1,6 @@
 //! Random federations.
 
-use super::{Federation, FederateSpec, LinkSpec, PortRef, ReactionPlan, ReactorSpec, WireSpec};
+use super::{FederateSpec, Federation, LinkSpec, PortRef, ReactionPlan, ReactorSpec, WireSpec};
 use crate::seed::Rng;
 use crate::swarm::{Ending, Shape, Swarm};
 use ictus_core::{ActionKind, Delay, Duration, DurationExt as _, ProgramError};
@@ -59,7 +59,11 @@ impl Federation {
             let delay = Delay::None;
             self.links.push(LinkSpec { from, to, delay });
         }
-        let period = if finite { Duration::ZERO } else { grains(rng.between(1, 6)) };
+        let period = if finite {
+            Duration::ZERO
+        } else {
+            grains(rng.between(1, 6))
+        };
         let eagerness = *rng.pick(&[50, 90, 100]);
         let reacts = |inputs: &[usize], effects: &[usize]| ReactionPlan {
             inputs: inputs.to_vec(),
@@ -83,12 +87,20 @@ impl Federation {
         asker.reactors[r].reactions.push(reacts(&[0], &[]));
         asker.wire(PortRef::Output(p, 0), PortRef::Input(q, 0), Delay::None);
         asker.wire(PortRef::Output(q, 0), PortRef::Output(0, asks), Delay::None);
-        asker.wire(PortRef::Input(0, answered), PortRef::Input(r, 0), Delay::None);
+        asker.wire(
+            PortRef::Input(0, answered),
+            PortRef::Input(r, 0),
+            Delay::None,
+        );
         let answerer = &mut self.federates[b];
         let s = answerer.add("s", 1, 1);
         answerer.reactors[s].reactions.push(reacts(&[0], &[0]));
         answerer.wire(PortRef::Input(0, asked), PortRef::Input(s, 0), Delay::None);
-        answerer.wire(PortRef::Output(s, 0), PortRef::Output(0, answers), Delay::None);
+        answerer.wire(
+            PortRef::Output(s, 0),
+            PortRef::Output(0, answers),
+            Delay::None,
+        );
     }
 
     fn add_input(&mut self, federate: usize) -> usize {
@@ -203,7 +215,11 @@ impl Draft {
         }
         let lanes = rng.between(1, 4).max(given.len().div_ceil(2));
         for lane in 0..lanes {
-            let share = if lane + 1 == lanes { given.len() } else { given.len().min(rng.between(0, 2)) };
+            let share = if lane + 1 == lanes {
+                given.len()
+            } else {
+                given.len().min(rng.between(0, 2))
+            };
             let sources = given.drain(..share).collect();
             self.add_lane(lane, sources, rng);
         }
@@ -230,7 +246,11 @@ impl Draft {
 
     /// A reactor, or a bank of equal ones, and perhaps a reactor behind it.
     fn add_lane(&mut self, lane: usize, sources: Vec<PortRef>, rng: &mut Rng) {
-        let bank = if rng.percent(20) { rng.between(2, 3) } else { 1 };
+        let bank = if rng.percent(20) {
+            rng.between(2, 3)
+        } else {
+            1
+        };
         let mut template = ReactorSpec {
             inputs: sources.len(),
             outputs: rng.between(1, 2),
@@ -239,7 +259,11 @@ impl Draft {
         self.draw_actions(&mut template, rng);
         self.draw_reactions(&mut template, rng);
         for member in 0..bank {
-            let name = if bank == 1 { format!("r{lane}") } else { format!("b{lane}[{member}]") };
+            let name = if bank == 1 {
+                format!("r{lane}")
+            } else {
+                format!("b{lane}[{member}]")
+            };
             let at = self.spec.add(&name, 0, 0);
             let path = std::mem::take(&mut self.spec.reactors[at].path);
             self.spec.reactors[at] = ReactorSpec {
@@ -271,7 +295,9 @@ impl Draft {
             ..ReactorSpec::default()
         };
         if rng.percent(30) {
-            inner.actions.push(ActionKind::Logical { min_delay: Duration::ZERO });
+            inner.actions.push(ActionKind::Logical {
+                min_delay: Duration::ZERO,
+            });
         }
         self.draw_reactions(&mut inner, rng);
         self.spec.reactors[at] = inner;
@@ -283,7 +309,11 @@ impl Draft {
     fn draw_actions(&self, reactor: &mut ReactorSpec, rng: &mut Rng) {
         let timer = |rng: &mut Rng| ActionKind::Timer {
             offset: grains(rng.between(0, if self.finite { 40 } else { 4 })),
-            period: if self.finite { Duration::ZERO } else { grains(rng.between(2, 12)) },
+            period: if self.finite {
+                Duration::ZERO
+            } else {
+                grains(rng.between(2, 12))
+            },
         };
         let timers = if self.finite { 4 } else { 1 };
         if reactor.inputs == 0 || rng.percent(40) {
@@ -355,12 +385,22 @@ impl Draft {
         let top_spec = &mut self.spec.reactors[0];
         top_spec.actions = top.actions;
         if rng.percent(50) || own.is_empty() {
-            let period = if self.finite { Duration::ZERO } else { grains(rng.between(3, 12)) };
+            let period = if self.finite {
+                Duration::ZERO
+            } else {
+                grains(rng.between(3, 12))
+            };
             let offset = grains(rng.between(0, 3));
             top_spec.actions.push(ActionKind::Timer { offset, period });
         }
         let count = rng.between(1, 3);
-        let mut reactions = vec![ReactionPlan { eagerness: 60, ..ReactionPlan::default() }; count];
+        let mut reactions = vec![
+            ReactionPlan {
+                eagerness: 60,
+                ..ReactionPlan::default()
+            };
+            count
+        ];
         for (index, action) in top_spec.actions.iter().enumerate() {
             reactions[rng.below(count)].actions.push(index);
             if matches!(action, ActionKind::Logical { .. }) {
@@ -378,7 +418,11 @@ impl Draft {
 }
 
 fn grains(count: usize) -> Duration {
-    Duration::from_nanos(i64::try_from(count).unwrap_or(i64::MAX).saturating_mul(GRAIN))
+    Duration::from_nanos(
+        i64::try_from(count)
+            .unwrap_or(i64::MAX)
+            .saturating_mul(GRAIN),
+    )
 }
 
 /// Connections between federates: forward ones, and backward ones when the run has cycles.
@@ -398,7 +442,11 @@ fn draw_links(swarm: &Swarm, rng: &mut Rng) -> Vec<LinkSpec> {
             outputs[from] - 1
         };
         let delay = draw_delay(swarm.shape, rng);
-        let delay = if from == to && delay == Delay::None { Delay::Microstep } else { delay };
+        let delay = if from == to && delay == Delay::None {
+            Delay::Microstep
+        } else {
+            delay
+        };
         links.push(LinkSpec {
             from: (from, output),
             to: (to, inputs[to]),

@@ -42,6 +42,8 @@ pub(super) struct Host<E> {
     terse: bool,
     /// The last tag whose lateness was looked at.
     timed: Tag,
+    /// When which tag was completed, for whoever hears of it by LTC alone.
+    completed: Vec<(i64, Tag)>,
     /// The last tag that an event from outside got, per action.
     outside: BTreeMap<ActionId, Tag>,
 }
@@ -81,6 +83,7 @@ impl<E: SimulatedExecutor> Host<E> {
             legacy: member.legacy,
             terse: rng.percent(15),
             timed: Tag::NEVER,
+            completed: Vec::new(),
             outside: BTreeMap::new(),
             rng,
         }
@@ -96,7 +99,9 @@ impl<E: SimulatedExecutor> Host<E> {
             stop: timeline.stop_tag(),
             at: timeline.at(),
             tags: self.federate.counters().tags,
-            outcome: (self.state == State::Over).then(|| self.federate.into_outcome()).flatten(),
+            outcome: (self.state == State::Over)
+                .then(|| self.federate.into_outcome())
+                .flatten(),
             executor: self.executor,
         }
     }
@@ -113,7 +118,8 @@ impl<E: SimulatedExecutor> Host<E> {
         let executing = timeline.current().is_some();
         // What is written at the end of a program that has nothing left stays in the federate.
         let starved = self.starves && timeline.at() >= timeline.stop_tag();
-        let next = if self.is_over() || timeline.finished() || starved {
+        let over = self.is_over() || timeline.finished() || starved;
+        let next = if over {
             Tag::FOREVER
         } else if executing && !self.executor.quiet() {
             timeline.at()
@@ -125,6 +131,7 @@ impl<E: SimulatedExecutor> Host<E> {
             executing,
             next,
             stop: timeline.stop_tag(),
+            over,
         }
     }
 
@@ -139,9 +146,23 @@ impl<E: SimulatedExecutor> Host<E> {
             return false;
         };
         let start = self.federate.timeline().start_tag().time;
-        let by_now = self.clock.reading(now).saturating_add(min_delay).as_logical();
+        let by_now = self
+            .clock
+            .reading(now)
+            .saturating_add(min_delay)
+            .as_logical();
         let spaced = last.map_or(start, |tag| tag.time + min_spacing);
         tag.time > by_now.max(spaced).max(start)
+    }
+
+    /// When others could know from LTCs alone that nothing up to `tag` comes from here any more.
+    fn confirmed_at(&self, tag: Tag) -> i64 {
+        let later = |entry: &&(i64, Tag)| entry.1 >= tag;
+        match self.completed.iter().find(later) {
+            Some((at, _)) if self.legacy => *at,
+            None if self.legacy => i64::MAX,
+            Some(_) | None => i64::MIN,
+        }
     }
 
     pub(super) fn woken(&mut self, now: i64) -> bool {
@@ -209,7 +230,9 @@ impl<E: SimulatedExecutor> World<E> {
         }
         if !host.received.is_empty() {
             let position = host.position();
-            let used = host.federate.receive(now, &host.received, &mut host.executor);
+            let used = host
+                .federate
+                .receive(now, &host.received, &mut host.executor);
             self.observer
                 .federate_read(federate, &host.received[..used], position);
             if used < host.received.len() {
@@ -261,17 +284,29 @@ impl<E: SimulatedExecutor> World<E> {
     /// In a calm run a tag is begun when it is due, but for what messages need on their way.
     fn check_lateness(&mut self, federate: usize, position: Position) {
         let host = &mut self.hosts[federate];
-        let started = host.federate.timeline().start_tag() != Tag::NEVER;
+        let start = host.federate.timeline().start_tag();
+        if !position.executing {
+            host.completed.push((self.now, position.at));
+        }
         let known = std::mem::replace(&mut host.timed, position.at) == position.at;
-        if known || !started || position.at < host.federate.timeline().start_tag() {
+        if known || start == Tag::NEVER || position.at < start {
             return;
         }
-        let due = host.clock.when(position.at.time.as_physical());
-        let late = self.now - due.unwrap_or(self.now);
+        let due = host
+            .clock
+            .when(position.at.time.as_physical())
+            .unwrap_or(self.now);
+        let upstream = self.observer.upstream(federate);
+        let told = upstream.map(|u| self.hosts[u].confirmed_at(position.at));
+        let due = told.max().unwrap_or(due).max(due);
+        let late = self.now - due;
         let count = i64::try_from(self.hosts.len()).unwrap_or(i64::MAX);
         let bound = 6 * (count + 1) * self.conditions.swarm.network.delay_max.as_nanos() + 50_000;
         if late > bound {
-            let what = format!("federate {federate} began {} late by {late} ns", position.at);
+            let what = format!(
+                "federate {federate} began {} late by {late} ns",
+                position.at
+            );
             self.observer.blame("promptness", what);
         }
     }
@@ -399,7 +434,9 @@ impl<E: SimulatedExecutor> World<E> {
         if host.state != State::Alive || host.federate.resigned() {
             return;
         }
-        let next = host.rng.span(Duration::from_micros(200), Duration::from_millis(15));
+        let next = host
+            .rng
+            .span(Duration::from_micros(200), Duration::from_millis(15));
         let late = host.rng.span(Duration::ZERO, Duration::from_micros(400));
         let draw = host.rng.bits();
         let started = host.federate.timeline().start_tag() != Tag::NEVER;
@@ -410,7 +447,8 @@ impl<E: SimulatedExecutor> World<E> {
             let last = host.outside.insert(action, tag);
             let late = host.deferred_too_far(action, tag, last, now);
             if late {
-                let what = format!("event from outside at {stamp:?} got {tag} in federate {federate}");
+                let what =
+                    format!("event from outside at {stamp:?} got {tag} in federate {federate}");
                 self.observer.blame("promptness", what);
             }
             self.observer.coverage.hit(Feature::PhysicalAction);

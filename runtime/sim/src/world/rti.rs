@@ -35,14 +35,20 @@ impl RtiHost {
         let clocks = conditions.swarm.clocks;
         let offset = rng.span(-clocks.offset, clocks.offset);
         let mut config = RtiConfig::new("simulated", u16::try_from(federates).unwrap_or(u16::MAX));
-        config.clock_exchanges = if conditions.swarm.mode.clock_sync { 10 } else { 0 };
+        config.clock_exchanges = if conditions.swarm.mode.clock_sync {
+            10
+        } else {
+            0
+        };
         config.dnet = conditions.swarm.mode.dnet;
         config.mutants = conditions.mutants;
         Self {
             rti: Rti::new(config),
             clock: HostClock::new(offset, 0),
             rng,
-            peers: std::iter::repeat_with(Peer::default).take(federates).collect(),
+            peers: std::iter::repeat_with(Peer::default)
+                .take(federates)
+                .collect(),
             dead: false,
             wake_at: None,
             calm: conditions.swarm.mode.calm,
@@ -97,7 +103,9 @@ impl RtiHost {
     pub(super) fn dawdle(&mut self) -> i64 {
         let most = *self.rng.pick(&[0, 0, 5_000, 300_000]);
         let most = if self.calm { 0 } else { most };
-        self.rng.span(Duration::ZERO, Duration::from_nanos(most)).as_nanos()
+        self.rng
+            .span(Duration::ZERO, Duration::from_nanos(most))
+            .as_nanos()
     }
 }
 
@@ -119,7 +127,12 @@ impl<E: SimulatedExecutor> World<E> {
         }
         self.rti_decide();
         self.rti_disconnect();
-        if let Some(at) = self.rti.rti.poll_timeout().and_then(|at| self.rti.clock.when(at)) {
+        if let Some(at) = self
+            .rti
+            .rti
+            .poll_timeout()
+            .and_then(|at| self.rti.clock.when(at))
+        {
             self.wake_rti(at);
         }
     }
@@ -127,7 +140,9 @@ impl<E: SimulatedExecutor> World<E> {
     fn rti_read(&mut self, federate: usize) {
         let now = self.rti.clock.reading(self.now);
         let peer = &mut self.rti.peers[federate];
-        let Some(connection) = peer.connection else { return };
+        let Some(connection) = peer.connection else {
+            return;
+        };
         let up = &mut self.hosts[federate].up;
         while let Some(arrival) = up.take(self.now) {
             match arrival {
@@ -164,7 +179,11 @@ impl<E: SimulatedExecutor> World<E> {
         self.rti.rti.drain(now);
         let truth = self.truth();
         while let Some(connection) = self.rti.rti.poll_output() {
-            let Some(federate) = self.rti.peers.iter().position(|p| p.connection == Some(connection))
+            let Some(federate) = self
+                .rti
+                .peers
+                .iter()
+                .position(|p| p.connection == Some(connection))
             else {
                 continue;
             };
@@ -172,7 +191,9 @@ impl<E: SimulatedExecutor> World<E> {
             while !output.chunk().is_empty() {
                 let chunk = output.chunk();
                 self.observer.rti_wrote(federate, chunk, &truth);
-                self.hosts[federate].down.write(self.now, chunk, &mut self.wakes);
+                self.hosts[federate]
+                    .down
+                    .write(self.now, chunk, &mut self.wakes);
                 output.advance(chunk.len());
             }
             let closing = output.closing();
