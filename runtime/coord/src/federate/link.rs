@@ -156,7 +156,7 @@ pub(super) struct Link {
     held_back_count: u64,
     /// Nothing more may be sent: it was promised.
     silent: bool,
-    /// An agreed stop tag, which may come before what was promised.
+    /// An agreed stop tag that comes before what was promised.
     silent_at: Option<Tag>,
 }
 
@@ -334,6 +334,7 @@ impl Link {
     /// A message has come, or a stop was agreed: the RTI counts its tag as announced if it is earlier than what was.
     #[inline]
     pub(super) fn message_arrived(&mut self, tag: Tag) {
+        self.silent_at = self.silent_at.filter(|stop| tag > *stop);
         if tag < self.announced {
             self.announced = tag;
             self.pending_announcement = self.pending_announcement.map(|pending| pending.min(tag));
@@ -370,7 +371,7 @@ impl Link {
     /// this federate writes at the stop tag stays here if it comes before what was announced.
     pub(super) fn revoke_from(&mut self, stop: Tag, timeline: &mut Timeline) {
         if !self.config.extensions {
-            self.silent_at = Some(stop);
+            self.silent_at = (self.announced > stop).then_some(stop);
             return;
         }
         let before = stop.latest_earlier();
@@ -460,7 +461,7 @@ impl Link {
         self.told_at[node.index()] = at;
         let link = self.config.outputs[output.index()];
         let tag = at.delayed(link.delay);
-        let silent = self.silent || (self.silent_at == Some(at) && self.announced > at);
+        let silent = self.silent || self.silent_at == Some(at);
         if silent || tag > timeline.stop_tag() || tag == Tag::FOREVER {
             return false;
         }
