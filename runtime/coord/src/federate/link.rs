@@ -335,6 +335,7 @@ impl Link {
     #[inline]
     pub(super) fn message_arrived(&mut self, tag: Tag) {
         self.silent_at = self.silent_at.filter(|stop| tag > *stop);
+        self.skipped = self.skipped.filter(|skipped| *skipped <= tag);
         if tag < self.announced {
             self.announced = tag;
             self.pending_announcement = self.pending_announcement.map(|pending| pending.min(tag));
@@ -461,8 +462,13 @@ impl Link {
         self.told_at[node.index()] = at;
         let link = self.config.outputs[output.index()];
         let tag = at.delayed(link.delay);
-        let silent = self.silent || self.silent_at == Some(at);
-        if silent || tag > timeline.stop_tag() || tag == Tag::FOREVER {
+        if self.silent || self.silent_at == Some(at) {
+            if self.config.in_cycle {
+                self.say_absent(output, at);
+            }
+            return false;
+        }
+        if tag > timeline.stop_tag() || tag == Tag::FOREVER {
             return false;
         }
         wire::encode_tagged_message(link.port_id, link.federate, tag, &mut self.out, payload);
