@@ -138,6 +138,8 @@ pub(super) struct Link {
     provisional: VecDeque<Tag>,
     /// What the RTI takes for the next event here: the last NET, sent or pending, or the tag of a message since.
     announced: Tag,
+    /// What downstreams count on: the largest NET, unless a message has lowered it.
+    promised: Tag,
     /// The last NET that was found needless, until one is sent.
     skipped: Option<Tag>,
     skipped_count: u64,
@@ -179,6 +181,7 @@ impl Link {
             granted: Tag::NEVER,
             provisional: VecDeque::new(),
             announced: Tag::NEVER,
+            promised: Tag::NEVER,
             skipped: None,
             skipped_count: 0,
             promised_at: PhysicalTime::NEVER,
@@ -218,7 +221,7 @@ impl Link {
         if self.config.downstream.is_empty() {
             return Tag::NEVER;
         }
-        self.announced
+        self.promised
     }
 
     /// The first provisionally granted tag that is still to be executed, FOREVER when there is none.
@@ -319,6 +322,7 @@ impl Link {
             || (!self.config.upstream.is_empty() && self.granted < next);
         if needed {
             self.announced = next;
+            self.promised = self.promised.max(next);
             self.pending_announcement = Some(next);
             self.skipped = None;
         } else if self.skipped != Some(next) {
@@ -331,10 +335,17 @@ impl Link {
         self.config.mutants.has(Mutant::SkippedNextForgotten)
     }
 
-    /// A message has come, or a stop was agreed: the RTI counts its tag as announced if it is earlier than what was.
+    /// A message has come, or a stop was agreed: the RTI counts its tag as announced if it is earlier than what was, and
+    /// nothing downstream was granted past it.
     #[inline]
     pub(super) fn message_arrived(&mut self, tag: Tag) {
         self.silent_at = self.silent_at.filter(|stop| tag > *stop);
+        self.promised = self.promised.min(tag);
+        self.lower_announced(tag);
+    }
+
+    #[inline]
+    fn lower_announced(&mut self, tag: Tag) {
         self.skipped = self.skipped.filter(|skipped| *skipped <= tag);
         if tag < self.announced {
             self.announced = tag;
@@ -352,6 +363,7 @@ impl Link {
             && through < skipped
         {
             self.skipped = None;
+            self.promised = self.promised.max(skipped);
             self.announced = skipped;
             self.pending_announcement = Some(skipped);
         }
@@ -409,6 +421,10 @@ impl Link {
         self.forget_provisional(timeline.at());
         if timeline.at() < tag {
             self.provisional.push_back(tag);
+            if self.config.extensions {
+                // Our RTI takes it for the next event here, without being told.
+                self.lower_announced(tag);
+            }
         } else if timeline.current() != Some(tag) {
             // It is over: what was not sent at it never will be.
             for index in 0..self.senders.len() {

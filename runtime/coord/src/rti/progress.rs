@@ -79,7 +79,11 @@ impl Rti {
     pub(super) fn record_next_event(&mut self, federate: FederateId, tag: Tag) {
         let in_transit = self.members[federate.index()].in_transit.front();
         let tag = in_transit.map_or(tag, |&first| tag.min(first));
+        let ours = self.members[federate.index()].capabilities.is_some();
         let standing = &mut self.standings[federate.index()];
+        // A provisional tag will be executed: a NET that crossed its PTAG does not know of it.
+        let under_way = ours && standing.provisional > standing.completed;
+        let tag = if under_way { tag.min(standing.provisional) } else { tag };
         standing.next_event = tag;
         if self.topology.upstream(federate).is_empty() {
             standing.granted = tag;
@@ -181,6 +185,9 @@ impl Rti {
             }
             Grant::Provisional(tag) => {
                 standing.provisional = tag;
+                if self.members[federate.index()].capabilities.is_some() {
+                    standing.next_event = standing.next_event.min(tag);
+                }
                 provisional.push((federate, tag));
                 self.send(federate, &ToFederate::ProvisionalTagAdvanceGrant(tag));
             }
