@@ -1,6 +1,11 @@
 //! What the end-to-end tests share: the `ictus` binary in a state directory of its own.
 
-#![expect(clippy::unwrap_used, clippy::missing_panics_doc, reason = "a test stops at the first surprise")]
+#![expect(
+    clippy::unwrap_used,
+    clippy::missing_panics_doc,
+    clippy::panic,
+    reason = "a test stops at the first surprise"
+)]
 
 use serde_json::Value;
 use std::path::{Path, PathBuf};
@@ -13,7 +18,10 @@ const BOUND_S: u32 = 240;
 /// The root of the work tree.
 #[must_use]
 pub fn root() -> PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR")).parent().unwrap().to_owned()
+    Path::new(env!("CARGO_MANIFEST_DIR"))
+        .parent()
+        .unwrap()
+        .to_owned()
 }
 
 /// The release binary that `.ci/test` builds first: `target/release/ictus` beside the test's `target/debug/deps`.
@@ -46,7 +54,9 @@ impl Sandbox {
     /// An empty one.
     #[must_use]
     pub fn new() -> Self {
-        Self { state: tempfile::Builder::new().prefix("ictus-").tempdir().unwrap() }
+        Self {
+            state: tempfile::Builder::new().prefix("ictus-").tempdir().unwrap(),
+        }
     }
 
     /// The state directory.
@@ -87,7 +97,12 @@ impl Sandbox {
     /// Runs it and expects this exit code; returns standard error.
     pub fn fails(&self, args: &[&str], code: i32) -> String {
         let output = self.run(args);
-        assert_eq!(output.status.code(), Some(code), "ictus {args:?}: {}", said(&output));
+        assert_eq!(
+            output.status.code(),
+            Some(code),
+            "ictus {args:?}: {}",
+            said(&output)
+        );
         String::from_utf8(output.stderr).unwrap()
     }
 
@@ -101,8 +116,14 @@ impl Sandbox {
     /// One federation of `ictus ps`.
     pub fn view(&self, federation: &str) -> Value {
         let views = self.json(&["ps"]);
-        let found = views.as_array().unwrap().iter().find(|view| view["name"] == federation);
-        found.unwrap_or_else(|| panic!("no {federation} in {views}")).clone()
+        let found = views
+            .as_array()
+            .unwrap()
+            .iter()
+            .find(|view| view["name"] == federation);
+        found
+            .unwrap_or_else(|| panic!("no {federation} in {views}"))
+            .clone()
     }
 
     /// Returns when the federation has ended, and how it looks then.

@@ -14,11 +14,26 @@ const ARROWS: &[(&str, &[&str])] = &[
     ("ictus-macros", &[]),
     ("ictus-coord", &["ictus-core"]),
     ("ictus-sim", &["ictus-core", "ictus-coord"]),
-    ("ictus", &["ictus-core", "ictus-coord", "ictus-macros", "ictus-sim"]),
+    (
+        "ictus",
+        &["ictus-core", "ictus-coord", "ictus-macros", "ictus-sim"],
+    ),
     ("ictus-rti", &["ictus-core", "ictus-coord"]),
     ("ictus-deploy", &["ictus-core", "ictus-coord"]),
-    ("ictusd", &["ictus-core", "ictus-coord", "ictus-deploy", "ictus-rti"]),
-    ("ictus-cli", &["ictus-core", "ictus-coord", "ictus-deploy", "ictus-rti", "ictusd"]),
+    (
+        "ictusd",
+        &["ictus-core", "ictus-coord", "ictus-deploy", "ictus-rti"],
+    ),
+    (
+        "ictus-cli",
+        &[
+            "ictus-core",
+            "ictus-coord",
+            "ictus-deploy",
+            "ictus-rti",
+            "ictusd",
+        ],
+    ),
 ];
 
 /// Crates that may depend on tokio.
@@ -28,7 +43,10 @@ const ASYNC: &[&str] = &["ictus-deploy", "ictusd", "ictus-cli"];
 const FILE_LINES_MAX: usize = 700;
 
 fn root() -> PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR")).parent().unwrap().to_owned()
+    Path::new(env!("CARGO_MANIFEST_DIR"))
+        .parent()
+        .unwrap()
+        .to_owned()
 }
 
 fn tracked(ending: &str) -> Vec<PathBuf> {
@@ -39,24 +57,40 @@ fn tracked(ending: &str) -> Vec<PathBuf> {
         .unwrap();
     assert!(output.status.success(), "git ls-files");
     let names = String::from_utf8(output.stdout).unwrap();
-    let paths = names.lines().filter(|name| name.ends_with(ending)).map(|name| root().join(name));
+    let paths = names
+        .lines()
+        .filter(|name| name.ends_with(ending))
+        .map(|name| root().join(name));
     paths.filter(|path| path.exists()).collect()
 }
 
 fn metadata() -> Value {
     let output = Command::new(env!("CARGO"))
-        .args(["metadata", "--format-version", "1", "--no-deps", "--offline"])
+        .args([
+            "metadata",
+            "--format-version",
+            "1",
+            "--no-deps",
+            "--offline",
+        ])
         .current_dir(root())
         .output()
         .unwrap();
-    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    assert!(
+        output.status.success(),
+        "{}",
+        String::from_utf8_lossy(&output.stderr)
+    );
     serde_json::from_slice(&output.stdout).unwrap()
 }
 
 /// The direct dependencies of a package, development ones left out.
 fn dependencies(package: &Value) -> BTreeSet<&str> {
     let dependencies = package["dependencies"].as_array().unwrap().iter();
-    dependencies.filter(|d| d["kind"] != "dev").map(|d| d["name"].as_str().unwrap()).collect()
+    dependencies
+        .filter(|d| d["kind"] != "dev")
+        .map(|d| d["name"].as_str().unwrap())
+        .collect()
 }
 
 #[test]
@@ -65,13 +99,18 @@ fn imports_follow_the_arrows() {
     let ours: BTreeSet<&str> = ARROWS.iter().map(|(name, _)| *name).collect();
     for package in metadata["packages"].as_array().unwrap() {
         let name = package["name"].as_str().unwrap();
-        let Some((_, allowed)) = ARROWS.iter().find(|(known, _)| *known == name) else { continue };
+        let Some((_, allowed)) = ARROWS.iter().find(|(known, _)| *known == name) else {
+            continue;
+        };
         for dependency in dependencies(package) {
             assert!(
                 !ours.contains(dependency) || allowed.contains(&dependency),
                 "{name} may not import {dependency}: the arrows are in ARCHITECTURE.md"
             );
-            assert!(dependency != "tokio" || ASYNC.contains(&name), "{name} may not use tokio");
+            assert!(
+                dependency != "tokio" || ASYNC.contains(&name),
+                "{name} may not use tokio"
+            );
         }
     }
 }
@@ -91,7 +130,9 @@ fn every_crate_has_its_arrows() {
 fn code_lines(text: &str) -> usize {
     let body = text.split("\n#[cfg(test)]\nmod tests {").next().unwrap();
     let lines = body.lines().map(str::trim);
-    lines.filter(|line| !line.is_empty() && !line.starts_with("//")).count()
+    lines
+        .filter(|line| !line.is_empty() && !line.starts_with("//"))
+        .count()
 }
 
 #[test]
@@ -108,8 +149,16 @@ fn files_are_short() {
 
 #[test]
 fn nothing_is_left_over() {
-    let marks = [["FIX", "ME"].concat(), ["TO", "DO:"].concat(), ["XX", "X:"].concat()];
-    for path in tracked(".rs").into_iter().chain(tracked(".md")).chain(tracked(".toml")) {
+    let marks = [
+        ["FIX", "ME"].concat(),
+        ["TO", "DO:"].concat(),
+        ["XX", "X:"].concat(),
+    ];
+    for path in tracked(".rs")
+        .into_iter()
+        .chain(tracked(".md"))
+        .chain(tracked(".toml"))
+    {
         let text = fs::read_to_string(&path).unwrap();
         for mark in &marks {
             assert!(!text.contains(mark), "{} contains {mark}", path.display());
@@ -121,13 +170,21 @@ fn nothing_is_left_over() {
 fn links_resolve() {
     for path in tracked(".md") {
         let text = fs::read_to_string(&path).unwrap();
-        for target in text.split("](").skip(1).filter_map(|rest| rest.split(')').next()) {
+        for target in text
+            .split("](")
+            .skip(1)
+            .filter_map(|rest| rest.split(')').next())
+        {
             let file = target.split('#').next().unwrap();
             if file.is_empty() || target.contains("://") {
                 continue;
             }
             let linked = path.parent().unwrap().join(file);
-            assert!(linked.exists(), "{}: link to {target} leads nowhere", path.display());
+            assert!(
+                linked.exists(),
+                "{}: link to {target} leads nowhere",
+                path.display()
+            );
         }
     }
 }
@@ -135,13 +192,28 @@ fn links_resolve() {
 #[test]
 fn every_module_file_is_used() {
     let sources = tracked(".rs");
-    let texts: Vec<String> = sources.iter().map(|p| fs::read_to_string(p).unwrap()).collect();
+    let texts: Vec<String> = sources
+        .iter()
+        .map(|p| fs::read_to_string(p).unwrap())
+        .collect();
     for path in &sources {
         let stem = path.file_stem().unwrap().to_str().unwrap();
         let root_file = ["lib", "main", "build"].contains(&stem)
-            || path.parent().is_some_and(|dir| dir.join("Cargo.toml").exists())
-            || path.parent().is_some_and(|dir| ["tests", "bin", "examples"].iter().any(|n| dir.ends_with(n)));
-        let declared = texts.iter().any(|text| text.contains(&format!("mod {stem};")));
-        assert!(root_file || declared, "{} is part of no crate", path.display());
+            || path
+                .parent()
+                .is_some_and(|dir| dir.join("Cargo.toml").exists())
+            || path.parent().is_some_and(|dir| {
+                ["tests", "bin", "examples"]
+                    .iter()
+                    .any(|n| dir.ends_with(n))
+            });
+        let declared = texts
+            .iter()
+            .any(|text| text.contains(&format!("mod {stem};")));
+        assert!(
+            root_file || declared,
+            "{} is part of no crate",
+            path.display()
+        );
     }
 }

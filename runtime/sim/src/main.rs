@@ -1,4 +1,4 @@
-//! `cargo sim -- --seeds N [--seed 0x51f3]... [--dump] [--mutants]`: checks seeds, prints what they showed.
+//! `cargo sim --seeds N [--seed 0x51f3]... [--dump] [--mutants]`: checks seeds, prints what they showed.
 
 use std::io::{self, Write};
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -32,9 +32,8 @@ fn main() -> ExitCode {
             Ok(false) | Err(_) => ExitCode::FAILURE,
         },
         Err(words) => {
-            let _ = writeln!(
-                io::stderr(),
-                "{words}\nusage: cargo sim -- [--seeds N] [--from N] [--seed 0xN]... [--dump] [--mutants]"
+            eprintln!(
+                "{words}\nusage: cargo sim [--seeds N] [--from N] [--seed 0xN]... [--dump] [--mutants]"
             );
             ExitCode::from(2)
         }
@@ -206,7 +205,7 @@ fn report(total: &mut Tally, out: &mut impl Write) -> io::Result<bool> {
     )?;
     write!(out, "{}", total.coverage.table())?;
     for (seed, what) in &total.failures {
-        writeln!(out, "reproduce: cargo sim -- --seed {seed:#x}\n  {what}")?;
+        writeln!(out, "reproduce: cargo sim --seed {seed:#x}\n  {what}")?;
     }
     let missing: Vec<_> = total.coverage.missing().collect();
     // A handful of seeds cannot show everything.

@@ -63,6 +63,10 @@ struct Seen {
 
 /// Watches a run.
 #[derive(Debug)]
+#[expect(
+    clippy::struct_excessive_bools,
+    reason = "facts that are independent of each other"
+)]
 pub struct Observer {
     topology: Topology,
     /// Per link: sender, receiver, receiver's port, delay.
@@ -120,6 +124,13 @@ impl Observer {
         self.start
     }
 
+    /// Whether tags are granted provisionally somewhere, which takes round trips per tag.
+    #[must_use]
+    pub fn has_zero_delay_cycle(&self) -> bool {
+        let mut federates = self.topology.federates();
+        federates.any(|f| self.topology.in_zero_delay_cycle(f))
+    }
+
     /// The immediate upstreams of a federate.
     pub fn upstream(&self, federate: usize) -> impl Iterator<Item = usize> {
         let upstream = self.topology.upstream(FederateId::from_index(federate));
@@ -149,7 +160,7 @@ impl Observer {
                 Ok(Some((message, length))) => {
                     bytes = &bytes[length..];
                     self.note(from, "->", &message);
-                    self.from_federate(from, &message);
+                    self.heard_from_federate(from, &message);
                 }
                 Ok(None) | Err(_) => {
                     let what = format!("federate {from} wrote what is no message");
@@ -168,7 +179,7 @@ impl Observer {
         }
     }
 
-    fn from_federate(&mut self, from: usize, message: &ToRti<'_>) {
+    fn heard_from_federate(&mut self, from: usize, message: &ToRti<'_>) {
         match message {
             ToRti::TaggedMessage(message) => self.message_sent(from, message),
             ToRti::PortAbsent(_) => self.coverage.hit(Feature::Absent),
@@ -231,7 +242,7 @@ impl Observer {
                 Ok(Some((message, length))) => {
                     bytes = &bytes[length..];
                     self.note(to, "<-", &message);
-                    self.from_rti(to, &message, truth);
+                    self.heard_from_rti(to, &message, truth);
                 }
                 Ok(None) | Err(_) => {
                     self.blame("safety", "the RTI wrote what is no message".to_owned());
@@ -241,7 +252,7 @@ impl Observer {
         }
     }
 
-    fn from_rti(&mut self, to: usize, message: &ToFederate<'_>, truth: &[Position]) {
+    fn heard_from_rti(&mut self, to: usize, message: &ToFederate<'_>, truth: &[Position]) {
         match message {
             ToFederate::TaggedMessage(message) => {
                 let seen = &mut self.seen[to];

@@ -82,6 +82,10 @@ pub fn describe(seed: u64) -> String {
 }
 
 /// Runs a federation once.
+///
+/// # Panics
+///
+/// When a generated federate has a loop without delay, which is a bug of the generator.
 #[must_use]
 pub fn simulate(
     federation: &Federation,
@@ -440,7 +444,7 @@ fn cover_structure(federation: &Federation, coverage: &mut Coverage, swarm: &Swa
         (Feature::TwoZeroDelayCycles, apart),
         (
             Feature::AnsweringPair,
-            swarm.shape.zero_delay_cycles && ids.iter().any(|f| in_zero_delay_cycle(&f)),
+            swarm.shape.zero_delay_cycles && ids.iter().any(in_zero_delay_cycle),
         ),
         (
             Feature::Cycle,

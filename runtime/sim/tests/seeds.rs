@@ -11,7 +11,7 @@ fn check(seeds: impl IntoIterator<Item = u64>) -> Coverage {
         let verdict = check_seed(seed, Mutants::NONE);
         if let Some(violation) = verdict.violation {
             panic!(
-                "reproduce: cargo sim -- --seed {seed:#x}\n{violation}\n{:?}",
+                "reproduce: cargo sim --seed {seed:#x}\n{violation}\n{:?}",
                 verdict.swarm
             );
         }

@@ -34,7 +34,11 @@ impl Faulty {
     #[reaction]
     fn tick(&mut self, _tick: &Timer, out: &mut Output<u64>) {
         self.ticks += 1;
-        assert!(self.ticks != self.at, "tick {} was the last straw", self.ticks);
+        assert!(
+            self.ticks != self.at,
+            "tick {} was the last straw",
+            self.ticks
+        );
         out.set(self.ticks);
     }
 }

@@ -160,6 +160,8 @@ pub(super) struct Link {
     silent: bool,
     /// An agreed stop tag that comes before what was promised.
     silent_at: Option<Tag>,
+    /// Lost federates, with the tags up to which they had sent all they would.
+    lost: Vec<(u16, Tag)>,
 }
 
 /// A run of messages that downstreams have not confirmed, by the tags they have there.
@@ -196,6 +198,7 @@ impl Link {
             held_back_count: 0,
             silent: false,
             silent_at: None,
+            lost: Vec::new(),
             config,
         }
     }
@@ -391,6 +394,7 @@ impl Link {
         self.granted = self.granted.min(before);
         self.provisional.retain(|tag| *tag < stop);
         timeline.unsettle_after(before);
+        self.settle_all_lost(timeline);
         self.message_arrived(stop);
     }
 
@@ -435,10 +439,17 @@ impl Link {
     }
 
     /// Takes FEDERATE_LOST: what `federate` has not sent up to `promise` it never will.
-    pub(super) fn settle_lost(&self, federate: u16, promise: Tag, timeline: &mut Timeline) {
-        for (index, input) in self.config.inputs.iter().enumerate() {
-            if input.federate == federate {
-                timeline.settle(InputId::new(index), promise);
+    pub(super) fn settle_lost(&mut self, federate: u16, promise: Tag, timeline: &mut Timeline) {
+        self.lost.push((federate, promise));
+        self.settle_all_lost(timeline);
+    }
+
+    fn settle_all_lost(&self, timeline: &mut Timeline) {
+        for (federate, promise) in &self.lost {
+            for (index, input) in self.config.inputs.iter().enumerate() {
+                if input.federate == *federate {
+                    timeline.settle(InputId::new(index), *promise);
+                }
             }
         }
     }

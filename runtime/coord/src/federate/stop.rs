@@ -153,7 +153,7 @@ impl Federate {
             limit
         };
         self.stop.limit = Some(self.stop.limit.map_or(limit, |earlier| earlier.min(limit)));
-        if let Some(link) = &self.link {
+        if let Some(link) = &mut self.link {
             link.settle_lost(federate, limit, &mut self.timeline);
         }
         if self.stop.lost.is_none() {

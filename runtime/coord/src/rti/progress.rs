@@ -83,7 +83,11 @@ impl Rti {
         let standing = &mut self.standings[federate.index()];
         // A provisional tag will be executed: a NET that crossed its PTAG does not know of it.
         let under_way = ours && standing.provisional > standing.completed;
-        let tag = if under_way { tag.min(standing.provisional) } else { tag };
+        let tag = if under_way {
+            tag.min(standing.provisional)
+        } else {
+            tag
+        };
         standing.next_event = tag;
         if self.topology.upstream(federate).is_empty() {
             standing.granted = tag;

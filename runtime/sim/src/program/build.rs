@@ -258,11 +258,14 @@ impl Pending {
                 name: (0, 0),
                 state: 0,
                 shutdown: plan.shutdown,
-                actions: [(plan.startup, ActionId::STARTUP), (plan.shutdown, ActionId::SHUTDOWN)]
-                    .into_iter()
-                    .filter_map(|(is, action)| is.then_some((action, salt(4, action.index()))))
-                    .chain(plan.actions.iter().map(|a| (actions[*a], salt(1, *a))))
-                    .collect(),
+                actions: [
+                    (plan.startup, ActionId::STARTUP),
+                    (plan.shutdown, ActionId::SHUTDOWN),
+                ]
+                .into_iter()
+                .filter_map(|(is, action)| is.then_some((action, salt(4, action.index()))))
+                .chain(plan.actions.iter().map(|a| (actions[*a], salt(1, *a))))
+                .collect(),
                 reads: Vec::new(),
                 effects: Vec::new(),
                 schedules: plan

@@ -15,6 +15,10 @@ use std::collections::BTreeMap;
 
 /// One host with one federate.
 #[derive(Debug)]
+#[expect(
+    clippy::struct_excessive_bools,
+    reason = "traits that are independent of each other"
+)]
 pub(super) struct Host<E> {
     pub(super) federate: Federate,
     pub(super) executor: E,
@@ -276,7 +280,7 @@ impl<E: SimulatedExecutor> World<E> {
         }
         let position = self.hosts[federate].position();
         self.observer.federate_ran(federate, position);
-        if self.conditions.swarm.mode.calm {
+        if self.conditions.swarm.mode.calm && !self.observer.has_zero_delay_cycle() {
             self.check_lateness(federate, position);
         }
     }
@@ -477,14 +481,18 @@ fn rewrite(mut bytes: &[u8], legacy: bool, done: Option<Tag>) -> Vec<u8> {
     let mut rewritten = Vec::new();
     while let Ok(Some((message, length))) = ToRti::decode(bytes) {
         bytes = &bytes[length..];
-        match message {
-            ToRti::NextEventTag(Tag::FOREVER) if bytes.first() == Some(&kind::RESIGN) => {}
-            ToRti::NextEventTag(next) if legacy && next != Tag::FOREVER => {
-                if let Some(done) = done.filter(|done| *done < next) {
-                    ToRti::LatestTagConfirmed(done).encode(&mut rewritten);
-                }
-            }
-            message => message.encode(&mut rewritten),
+        let ToRti::NextEventTag(next) = message else {
+            message.encode(&mut rewritten);
+            continue;
+        };
+        let resigns = next == Tag::FOREVER && bytes.first() == Some(&kind::RESIGN);
+        if resigns {
+            continue;
+        }
+        if !legacy || next == Tag::FOREVER {
+            message.encode(&mut rewritten);
+        } else if let Some(done) = done.filter(|done| *done < next) {
+            ToRti::LatestTagConfirmed(done).encode(&mut rewritten);
         }
     }
     rewritten
