@@ -282,10 +282,8 @@ impl Ask for Sandbox {
             .into_iter()
             .filter(|p| p.ends_with("daemon\0"))
             .collect();
-        let [daemon] = daemons.as_slice() else {
-            panic!("one daemon, not {daemons:?}")
-        };
-        daemon.split(' ').next().unwrap().parse().unwrap()
+        assert_eq!(daemons.len(), 1, "{daemons:?}");
+        daemons[0].split(' ').next().unwrap().parse().unwrap()
     }
 
     /// The on-demand daemon owns nothing and ends by itself; the kernel says when.
