@@ -65,14 +65,13 @@ fn tracked(ending: &str) -> Vec<PathBuf> {
 }
 
 fn metadata() -> Value {
+    cargo_metadata(&["--no-deps"])
+}
+
+fn cargo_metadata(arguments: &[&str]) -> Value {
     let output = Command::new(env!("CARGO"))
-        .args([
-            "metadata",
-            "--format-version",
-            "1",
-            "--no-deps",
-            "--offline",
-        ])
+        .args(["metadata", "--format-version", "1", "--offline"])
+        .args(arguments)
         .current_dir(root())
         .output()
         .unwrap();
@@ -123,6 +122,39 @@ fn every_crate_has_its_arrows() {
         let ours = name == "ictus" || name.starts_with("ictus-") || name == "ictusd";
         let known = name == "ictus-tests" || ARROWS.iter().any(|(known, _)| *known == name);
         assert!(!ours || known, "{name} is missing in tests/tidy.rs");
+    }
+}
+
+#[test]
+fn dependencies_follow_deny_toml() {
+    let rules = fs::read_to_string(root().join("deny.toml")).unwrap();
+    let rules: toml::Table = rules.parse().unwrap();
+    let allowed: Vec<&str> = rules["licenses"]["allow"]
+        .as_array()
+        .unwrap()
+        .iter()
+        .map(|licence| licence.as_str().unwrap())
+        .collect();
+    let banned = rules["bans"]["deny"].as_array().unwrap();
+    let platform = format!("{}-unknown-linux-gnu", std::env::consts::ARCH);
+    let metadata = cargo_metadata(&["--filter-platform", &platform]);
+    let packages = metadata["packages"].as_array().unwrap();
+    assert!(packages.len() > 100, "dependencies are listed");
+    for package in packages {
+        let name = package["name"].as_str().unwrap();
+        for ban in banned {
+            assert_ne!(ban["name"].as_str(), Some(name), "{:?}", ban["reason"]);
+        }
+        let source = package["source"].as_str();
+        let crates_io = source.is_none_or(|s| s.starts_with("registry+"));
+        assert!(crates_io, "{name} comes from {source:?}");
+        let licence = package["license"].as_str().unwrap_or_default();
+        let licence = spdx::Expression::parse_mode(licence, spdx::ParseMode::LAX).unwrap();
+        let permitted = licence.evaluate(|requirement| {
+            let id = requirement.license.id();
+            id.is_some_and(|id| allowed.contains(&id.name))
+        });
+        assert!(permitted, "{name} is under {licence}");
     }
 }
 

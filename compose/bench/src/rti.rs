@@ -78,9 +78,11 @@ impl Peer {
     }
 
     fn start(&mut self) -> io::Result<Tag> {
-        self.until(|message| match message {
-            ToFederate::Timestamp(start) => Some(Tag::at(start.as_nanos())),
-            _ => None,
+        self.until(|message| {
+            let ToFederate::Timestamp(start) = message else {
+                return None;
+            };
+            Some(Tag::at(start.as_nanos()))
         })
     }
 
@@ -122,12 +124,12 @@ pub(crate) fn flood(bench: &Bench, messages: u64) -> io::Result<f64> {
         let (mut seen, mut told) = (0_u64, 0_u64);
         sink.say(&[ToRti::NextEventTag(start)])?;
         while seen < messages {
-            let tag = sink.until(|message| match message {
-                ToFederate::TaggedMessage(message) => {
-                    seen += 1;
-                    (seen == messages || seen - told >= 10_000).then_some(message.tag)
-                }
-                _ => None,
+            let tag = sink.until(|message| {
+                let ToFederate::TaggedMessage(message) = message else {
+                    return None;
+                };
+                seen += 1;
+                (seen == messages || seen - told >= 10_000).then_some(message.tag)
             })?;
             told = seen;
             sink.say(&[
@@ -175,11 +177,11 @@ pub(crate) fn round_trips(bench: &Bench, count: u64) -> io::Result<Vec<u64>> {
         let tag = after(start, index * 1000);
         let begin = Instant::now();
         source.say(&[ToRti::NextEventTag(tag)])?;
-        sink.until(|message| match message {
-            ToFederate::TagAdvanceGrant(granted) => {
-                (*granted >= tag.latest_earlier()).then_some(())
-            }
-            _ => None,
+        sink.until(|message| {
+            let ToFederate::TagAdvanceGrant(granted) = message else {
+                return None;
+            };
+            (*granted >= tag.latest_earlier()).then_some(())
         })?;
         trips.push(u64::try_from(begin.elapsed().as_nanos()).unwrap_or(u64::MAX));
         sink.say(&[ToRti::NextEventTag(tag)])?;

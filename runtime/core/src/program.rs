@@ -84,7 +84,7 @@ pub struct ReactionSpec {
 /// What a node is.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum NodeKind {
-    /// A user's reaction: index into [`Program::reaction`].
+    /// A user's reaction: index into [`Program::reactions`].
     Reaction,
     /// Takes the value of a slot to the delayed connection's queue.
     Forward {

@@ -235,7 +235,9 @@ fn drive(timeline: &mut Timeline, program: &Program) -> (Vec<usize>, Progress) {
         let mut batch = Vec::new();
         match timeline.ready(&mut batch) {
             Progress::Batch => {}
-            progress => return (ran, progress),
+            progress @ (Progress::InFlight | Progress::Blocked | Progress::TagDone) => {
+                return (ran, progress);
+            }
         }
         for node in &batch {
             ran.push(node.index());

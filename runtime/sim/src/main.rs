@@ -32,9 +32,8 @@ fn main() -> ExitCode {
             Ok(false) | Err(_) => ExitCode::FAILURE,
         },
         Err(words) => {
-            eprintln!(
-                "{words}\nusage: cargo sim [--seeds N] [--from N] [--seed 0xN]... [--dump] [--mutants]"
-            );
+            let usage = "cargo sim [--seeds N] [--from N] [--seed 0xN]... [--dump] [--mutants]";
+            drop(writeln!(io::stderr(), "{words}\nusage: {usage}"));
             ExitCode::from(2)
         }
     }

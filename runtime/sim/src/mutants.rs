@@ -17,25 +17,24 @@ pub(super) fn run(options: &Options, out: &mut impl Write) -> io::Result<bool> {
     let quiet = std::panic::take_hook();
     std::panic::set_hook(Box::new(|_| {}));
     let next = AtomicU64::new(0);
-    let rows = std::sync::Mutex::new(Vec::new());
-    std::thread::scope(|scope| {
-        for _ in 0..super::THREADS {
-            scope.spawn(|| {
-                loop {
-                    let index = usize::try_from(next.fetch_add(1, Ordering::Relaxed)).unwrap_or(0);
-                    let Some(mutant) = Mutant::ALL.get(index) else {
-                        return;
-                    };
-                    let row = hunt(*mutant, seeds);
-                    rows.lock()
-                        .expect("hunters do not panic")
-                        .push((index, row));
-                }
-            });
+    let work = || {
+        let mut rows = Vec::new();
+        loop {
+            let index = usize::try_from(next.fetch_add(1, Ordering::Relaxed)).unwrap_or(0);
+            let Some(mutant) = Mutant::ALL.get(index) else {
+                return rows;
+            };
+            rows.push((index, hunt(*mutant, seeds)));
         }
+    };
+    let mut rows: Vec<_> = std::thread::scope(|scope| {
+        let hunters: Vec<_> = (0..super::THREADS).map(|_| scope.spawn(work)).collect();
+        let joined = hunters.into_iter().map(|hunter| hunter.join());
+        joined
+            .flat_map(|rows| rows.expect("hunters do not panic"))
+            .collect()
     });
     std::panic::set_hook(quiet);
-    let mut rows = rows.into_inner().expect("hunters do not panic");
     rows.sort_unstable_by_key(|row| row.0);
     writeln!(
         out,

@@ -1,6 +1,6 @@
 //! A federation in a simulated world: hosts with clocks, a network, the RTI, faults, an observer. One seed, no thread.
 //!
-//! Every federate is driven as the documentation of [`Federate`] says, and the RTI as that of [`Rti`]: what a real driver
+//! Every federate is driven as the documentation of `Federate` says, and the RTI as that of `Rti`: what a real driver
 //! does with sockets and waits, the world does with an event queue over true time.
 
 mod host;
