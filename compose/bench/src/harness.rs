@@ -4,7 +4,7 @@ use serde_json::{Value, json};
 use std::fs;
 use std::io::{self, BufRead, BufReader, Read};
 use std::path::{Path, PathBuf};
-use std::process::{Child, Command, Stdio};
+use std::process::{Child, ChildStderr, Command, Stdio};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::thread;
@@ -184,6 +184,7 @@ pub(crate) const FEDERATION: &str = "bench";
 #[derive(Debug)]
 pub(crate) struct Rti {
     child: Child,
+    said: BufReader<ChildStderr>,
     /// Its TCP port.
     pub(crate) port: u16,
 }
@@ -208,11 +209,11 @@ impl Rti {
             .args(["--status-fd", "1"])
             .stdin(Stdio::null())
             .stdout(Stdio::piped())
+            .stderr(Stdio::piped())
             .spawn()?;
-        let stdout = child
-            .stdout
-            .take()
-            .ok_or_else(|| io::Error::other("no output"))?;
+        let (Some(stdout), Some(stderr)) = (child.stdout.take(), child.stderr.take()) else {
+            return Err(io::Error::other("no output"));
+        };
         let mut lines = BufReader::new(stdout);
         let mut line = String::new();
         while lines.read_line(&mut line)? > 0 {
@@ -222,6 +223,7 @@ impl Rti {
                 thread::spawn(move || io::copy(&mut lines, &mut io::sink()));
                 return Ok(Self {
                     child,
+                    said: BufReader::new(stderr),
                     port: u16::try_from(port).unwrap_or(0),
                 });
             }
@@ -261,7 +263,11 @@ impl Rti {
         if status.success() {
             Ok(())
         } else {
-            Err(io::Error::other(format!("the RTI ended with {status}")))
+            let mut words = String::new();
+            self.said.read_to_string(&mut words)?;
+            Err(io::Error::other(format!(
+                "the RTI ended with {status}:\n{words}"
+            )))
         }
     }
 }

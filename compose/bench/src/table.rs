@@ -106,7 +106,14 @@ impl Settings {
                 "",
             )?;
             let trips = rti::round_trips(bench, self.count(20_000))?;
-            row(&mut out, "rti NET -> TAG, us", &quantiles(&trips), "", "")?;
+            let floor = floor::relay_trip(self.count(20_000))?;
+            row(
+                &mut out,
+                "rti NET -> TAG p50/p99, us",
+                &quantiles(&trips),
+                &format!("tcp relay {}", quantiles(&floor)),
+                "",
+            )?;
         }
         if self.wants("latency") {
             self.latency(bench, &mut out)?;
@@ -163,7 +170,7 @@ impl Settings {
         let results = bench.federated(&case)?;
         let micros = |key| results.number(key).unwrap_or(f64::NAN) / 1000.0;
         let ours = format!("{:.1} / {:.1}", micros("p50_ns"), micros("p99_ns"));
-        let floor = floor::tcp_latency(
+        let floor = floor::relay_latency(
             usize::try_from(count).unwrap_or(100),
             Duration::from_millis(1),
         )?;
@@ -171,7 +178,7 @@ impl Settings {
             out,
             "1 kHz one way p50/p99, us",
             &ours,
-            &format!("tcp {}", quantiles(&floor)),
+            &format!("tcp relay {}", quantiles(&floor)),
             "",
         )
     }
