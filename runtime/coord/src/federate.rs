@@ -354,9 +354,10 @@ impl Federate {
         }
         executor.begin(self.timeline.at());
         let program = self.timeline.program();
-        for (action, value) in self.present.drain(..) {
-            executor.arrive(action, program.action_slot(action), value);
+        for (action, value) in &self.present {
+            executor.arrive(*action, program.action_slot(*action), *value);
         }
+        self.present.clear();
         if let Some(link) = &mut self.link {
             link.confirm_too_early(self.timeline.at());
         }

@@ -326,12 +326,14 @@ impl Timeline {
                 state.busy.remove(node.index());
             }
         }
-        for slot in effects.set.drain(..) {
+        for slot in &effects.set {
             state.trigger(&program.slot_triggers[slot.index()], program);
         }
-        for event in effects.scheduled.drain(..) {
-            state.schedule(program, event);
+        effects.set.clear();
+        for event in &effects.scheduled {
+            state.schedule(program, *event);
         }
+        effects.scheduled.clear();
     }
 
     /// Queues an event from outside and returns its tag: the stamp plus the action's minimum delay, but after the

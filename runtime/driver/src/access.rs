@@ -45,14 +45,19 @@ pub struct Outcome<'a> {
 
 impl Outcome<'_> {
     /// Adds `name=digest` to the trace, when there is one.
+    #[inline]
     pub(crate) fn note(&mut self, name: &str, digest: impl FnOnce() -> Option<u64>) {
-        let Some(trace) = &mut self.trace else {
-            return;
-        };
+        if let Some(trace) = &mut self.trace {
+            Self::write(trace, name, digest());
+        }
+    }
+
+    #[cold]
+    fn write(trace: &mut String, name: &str, digest: Option<u64>) {
         if !trace.is_empty() {
             trace.push(',');
         }
-        let _ = match digest() {
+        let _ = match digest {
             Some(digest) => write!(trace, "{name}={digest:016x}"),
             None => write!(trace, "{name}=?"),
         };

@@ -157,12 +157,13 @@ impl<T: Value> Item for LogicalAction<T> {
         if self.scheduled.is_empty() {
             return;
         }
-        for event in self.scheduled.drain(..) {
-            outcome.effects.scheduled.push(event);
+        for event in &self.scheduled {
+            outcome.effects.scheduled.push(*event);
             outcome.note(self.name, || {
                 digest_of(self.values.read().waiting.get(event.value)?)
             });
         }
+        self.scheduled.clear();
     }
 }
 
