@@ -188,8 +188,8 @@ impl Federate {
     /// A federate that will join over a connection: [`Federate::connect`] begins.
     #[must_use]
     pub fn federated(program: Arc<Program>, config: FederateConfig, link: LinkConfig) -> Self {
-        let senders = Timeline::new(Arc::clone(&program)).senders().collect();
-        Self::new(program, config, Some(Link::new(link, senders)))
+        let link = Link::new(link, &program);
+        Self::new(program, config, Some(link))
     }
 
     fn new(program: Arc<Program>, config: FederateConfig, link: Option<Link>) -> Self {
@@ -318,6 +318,8 @@ impl Federate {
                         self.send_absents();
                         return Poll::Wait(None);
                     }
+                    // Begun ahead: all inputs have spoken, but others may still count on this tag being open.
+                    Progress::TagDone if self.is_ahead() => return Poll::Wait(None),
                     Progress::TagDone => self.complete(),
                 }
             } else if self.timeline.overflowed() {
@@ -329,6 +331,13 @@ impl Federate {
                 return poll;
             }
         }
+    }
+
+    /// Whether the current tag was begun before it was granted, and is not yet.
+    fn is_ahead(&self) -> bool {
+        let at = self.timeline.at();
+        let ahead = |link: &Link| link.is_ahead(at);
+        self.link.as_ref().is_some_and(ahead) && !self.stop.gives_up(at)
     }
 
     /// Enters the next tag, or says how long to wait.

@@ -47,6 +47,8 @@ pub enum Mutant {
     PromiseIgnored,
     /// Federate: absent outputs of a zero-delay cycle are not reported.
     AbsentsDropped,
+    /// Federate: a tag begun before its inputs are known is completed without its grant.
+    AheadCompletes,
     /// Federate: the stop tag is answered as asked, though it has passed.
     StopReplyTooEarly,
 }
@@ -75,6 +77,7 @@ impl Mutant {
         Self::ConfirmedBeforeMessages,
         Self::PromiseIgnored,
         Self::AbsentsDropped,
+        Self::AheadCompletes,
         Self::StopReplyTooEarly,
     ];
 }

@@ -127,6 +127,9 @@ pub mod capability {
     pub const FLOW_CONTROL: u32 = 1;
     /// The federate understands [`super::ToFederate::FederateLost`].
     pub const FEDERATE_LOST: u32 = 2;
+    /// The federate has reactions that no network input can reach at the same tag: a TAG just before its NET, when messages
+    /// may still come at it, lets them run.
+    pub const RUNS_AHEAD: u32 = 4;
 }
 
 /// The value of [`ToRti::UdpPort`] that asks for no clock synchronization at all.

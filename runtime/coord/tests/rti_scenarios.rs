@@ -1,7 +1,7 @@
 //! Runs the tables in `testdata/`: who sends what, `----`, what everybody then receives.
 //!
 //! A file holds scenarios, each headed by `== TITLE` and settings, one a line:
-//! `federates N`, `edge A -> B [after MS]`, `ours ID...` (sends CAPABILITIES), `option dnet off`, `option clock K`,
+//! `federates N`, `edge A -> B [after MS]`, `ours ID...` (sends CAPABILITIES), `ahead ID...` (and RUNS_AHEAD), `option dnet off`, `option clock K`,
 //! `option multiple MS`. A step is some input lines, `----`, and the expected lines up to the next blank one. Every
 //! input line is one read and one round:
 //!
@@ -35,6 +35,7 @@ struct World {
     federates: u16,
     edges: Vec<(u16, u16, Delay)>,
     ours: Vec<u16>,
+    ahead: Vec<u16>,
     connections: BTreeMap<String, ConnectionId>,
     /// Bytes of each connection that the RTI has not taken yet.
     unread: BTreeMap<String, Vec<u8>>,
@@ -44,7 +45,7 @@ struct World {
 impl World {
     fn new(settings: &[&str]) -> Self {
         let mut config = RtiConfig::new(FEDERATION, 2);
-        let (mut edges, mut ours) = (Vec::new(), Vec::new());
+        let (mut edges, mut ours, mut ahead) = (Vec::new(), Vec::new(), Vec::new());
         for setting in settings {
             match *setting.split_whitespace().collect::<Vec<_>>() {
                 ["federates", n] => config.federates = n.parse().unwrap(),
@@ -57,6 +58,9 @@ impl World {
                 }
                 ["ours", ref ids @ ..] => {
                     ours.extend(ids.iter().map(|id| id.parse::<u16>().unwrap()));
+                }
+                ["ahead", ref ids @ ..] => {
+                    ahead.extend(ids.iter().map(|id| id.parse::<u16>().unwrap()));
                 }
                 ["option", "dnet", "off"] => config.dnet = false,
                 ["option", "clock", k] => config.clock_exchanges = k.parse().unwrap(),
@@ -73,6 +77,7 @@ impl World {
             origin: 0,
             edges,
             ours,
+            ahead,
             connections: BTreeMap::new(),
             unread: BTreeMap::new(),
             finished: false,
@@ -148,7 +153,9 @@ impl World {
         for id in 0..self.federates {
             let name = id.to_string();
             self.connect(&name);
-            let capabilities = if self.ours.contains(&id) {
+            let capabilities = if self.ahead.contains(&id) {
+                "CAPABILITIES 7; "
+            } else if self.ours.contains(&id) {
                 "CAPABILITIES 3; "
             } else {
                 ""
@@ -412,7 +419,7 @@ fn run(text: &str) -> String {
                 out.push_str(&world.step(input));
             }
             skipping = true;
-        } else if ["federates ", "edge ", "ours ", "option "]
+        } else if ["federates ", "edge ", "ours ", "ahead ", "option "]
             .iter()
             .any(|s| line.starts_with(s))
         {

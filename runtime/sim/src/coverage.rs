@@ -36,6 +36,7 @@ features! {
     PhysicalAction => "physical action",
     PhysicalDeferred => "physical event deferred to keep a promise",
     OutOfOrder => "reactions completed out of order",
+    RunsAhead => "tag begun before its inputs are known",
     FlowControlWait => "wait for flow control",
     StopByReaction => "stop by a reaction",
     StopFromOutside => "stop from outside",

@@ -59,6 +59,8 @@ struct Seen {
     asked_to_stop: bool,
     /// The last tag at which it may run ordinary reactions.
     promise: Option<Tag>,
+    /// The tag it had reached when it learnt of a loss.
+    entered_before_loss: Option<Tag>,
 }
 
 /// Watches a run.
@@ -141,6 +143,12 @@ impl Observer {
     #[must_use]
     pub fn promise(&self, federate: usize) -> Option<Tag> {
         self.seen[federate].promise
+    }
+
+    /// The tag that a federate had reached when it learnt of a loss.
+    #[must_use]
+    pub fn entered_before_loss(&self, federate: usize) -> Option<Tag> {
+        self.seen[federate].entered_before_loss
     }
 
     /// Whether anybody was lost: promises to the dead are void.
@@ -447,6 +455,10 @@ impl Observer {
         while let Ok(Some((message, length))) = ToFederate::decode(bytes) {
             bytes = &bytes[length..];
             self.note(federate, "reads", &message);
+            if matches!(message, ToFederate::FederateLost { .. }) {
+                let entered = &mut self.seen[federate].entered_before_loss;
+                entered.get_or_insert(position.at);
+            }
             let ToFederate::TaggedMessage(message) = message else {
                 continue;
             };
@@ -478,7 +490,15 @@ impl Observer {
         let seen = &self.seen[federate];
         let granted = seen.granted.max(seen.provisional).unwrap_or(Tag::NEVER);
         let shutdown_only = self.lost && position.at >= position.stop;
-        if position.at > granted && !shutdown_only {
+        // What needs no input runs once nothing can come before the tag; completing it takes the grant.
+        let ahead = self.extensions
+            && position.executing
+            && position.at > granted
+            && position.at.latest_earlier() <= granted;
+        if ahead {
+            self.coverage.hit(Feature::RunsAhead);
+        }
+        if position.at > granted && !shutdown_only && !ahead {
             let what = format!(
                 "federate {federate} ran {} but was granted {granted}",
                 position.at

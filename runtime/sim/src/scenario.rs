@@ -317,6 +317,8 @@ struct Limit {
     last: Tag,
     /// Ordinary reactions may run up to here, and again nothing but shutdown at the stop tag.
     promise: Option<Tag>,
+    /// The tag reached when the loss became known.
+    entered: Option<Tag>,
     stop: Tag,
 }
 
@@ -353,6 +355,7 @@ impl Limit {
         Self {
             last,
             promise,
+            entered: run.observer.entered_before_loss(index),
             stop,
         }
     }
@@ -362,8 +365,8 @@ impl Limit {
     }
 }
 
-/// No ordinary reaction past the promise of a lost one, but for what did not depend on it at the one tag that had been
-/// entered before the loss was known.
+/// No ordinary reaction past the promise of a lost one, but for what did not depend on it at tags that had been entered
+/// before the loss was known.
 fn check_limit(
     index: usize,
     limit: &Limit,
@@ -377,8 +380,8 @@ fn check_limit(
     let (promise, stop) = (since(promise, start), since(limit.stop, start));
     let tag = |r: &Record| (r.time, r.microstep);
     let mut past = records.iter().filter(|r| tag(r) > promise && tag(r) < stop);
-    let entered = past.clone().next().map(tag);
-    match past.find(|r| Some(tag(r)) != entered || expected.binary_search(r).is_err()) {
+    let entered = limit.entered.map(|entered| since(entered, start));
+    match past.find(|r| Some(tag(r)) > entered || expected.binary_search(r).is_err()) {
         Some(record) => Err(Violation {
             checker: "promise",
             what: format!("federate {index} ran {record:?} past {promise:?}, stop {stop:?}"),

@@ -166,9 +166,11 @@ impl Federate {
             NO_CLOCK_SYNC
         }));
         if link.config.extensions {
-            link.say(&ToRti::Capabilities(
-                capability::FLOW_CONTROL | capability::FEDERATE_LOST,
-            ));
+            let mut capabilities = capability::FLOW_CONTROL | capability::FEDERATE_LOST;
+            if link.runs_ahead() {
+                capabilities |= capability::RUNS_AHEAD;
+            }
+            link.say(&ToRti::Capabilities(capabilities));
         }
         match exchanges {
             Some(wanted) if wanted > 0 => {

@@ -5,9 +5,10 @@ use crate::plan::{ClockSync, ConnectionPlan, Plan};
 use crate::topology::{FederateId, Topology, connection_delay, zero_delay_cycle_inputs};
 use crate::wire::{self, NeighborStructure, PortAbsent, ToRti};
 use ictus_core::{
-    Delay, Duration, InputId, LogicalTime, NodeId, OutputId, PhysicalTime, Tag, Timeline,
+    Delay, Duration, InputId, LogicalTime, NodeId, OutputId, PhysicalTime, Program, Tag, Timeline,
 };
 use std::collections::VecDeque;
+use std::sync::Arc;
 
 /// How often a federate with physical actions renews its promise when it is not known what downstreams wait for.
 const ADVANCE_INTERVAL: Duration = Duration::from_millis(10);
@@ -152,6 +153,8 @@ pub(super) struct Link {
     /// Per sender node: the tag at which its output was last sent or said to be absent.
     told_at: Vec<Tag>,
     senders: Vec<(NodeId, OutputId)>,
+    /// The program has reactions that need no network input.
+    runs_ahead: bool,
     unconfirmed: VecDeque<Sent>,
     /// The last tag that had to wait for downstreams, and how many had to.
     held_back: Tag,
@@ -172,7 +175,8 @@ struct Sent {
 }
 
 impl Link {
-    pub(super) fn new(config: LinkConfig, senders: Vec<(NodeId, OutputId)>) -> Self {
+    pub(super) fn new(config: LinkConfig, program: &Arc<Program>) -> Self {
+        let senders: Vec<_> = Timeline::new(Arc::clone(program)).senders().collect();
         let nodes = senders
             .iter()
             .map(|(node, _)| node.index() + 1)
@@ -193,6 +197,7 @@ impl Link {
             last_confirmed: Tag::NEVER,
             told_at: vec![Tag::NEVER; nodes],
             senders,
+            runs_ahead: program.runs_ahead_of_inputs() && config.extensions,
             unconfirmed: VecDeque::new(),
             held_back: Tag::NEVER,
             held_back_count: 0,
@@ -209,6 +214,10 @@ impl Link {
 
     pub(super) fn in_cycle(&self) -> bool {
         self.config.in_cycle
+    }
+
+    pub(super) const fn runs_ahead(&self) -> bool {
+        self.runs_ahead
     }
 
     pub(super) fn skipped(&self) -> u64 {
@@ -276,7 +285,7 @@ impl Link {
             return self.promise(now, next, promise);
         }
         self.announce(next);
-        if !self.config.upstream.is_empty() && self.granted < next {
+        if !self.config.upstream.is_empty() && self.granted < self.enough(next) {
             return Permission::Wait(None);
         }
         if self.too_far_ahead(next) {
@@ -285,6 +294,24 @@ impl Link {
         } else {
             Permission::Enter
         }
+    }
+
+    /// The grant that `next` needs. Reactions that no network input reaches run as soon as nothing can come before it;
+    /// the others of that tag wait for its own grant.
+    fn enough(&self, next: Tag) -> Tag {
+        if self.runs_ahead && next != Tag::FOREVER {
+            next.latest_earlier()
+        } else {
+            next
+        }
+    }
+
+    /// Whether `at` is executed without having been granted.
+    pub(super) fn is_ahead(&self, at: Tag) -> bool {
+        self.runs_ahead
+            && !self.config.upstream.is_empty()
+            && self.granted < at
+            && !self.config.mutants.has(Mutant::AheadCompletes)
     }
 
     fn promise(&mut self, now: PhysicalTime, next: Tag, promise: PhysicalTime) -> Permission {

@@ -44,6 +44,8 @@ pub struct Standing {
     pub granted: Tag,
     /// The last PTAG sent to it.
     pub provisional: Tag,
+    /// Whether part of a tag can be executed there before its inputs are known at it (capability RUNS_AHEAD).
+    pub runs_ahead: bool,
 }
 
 impl Standing {
@@ -54,6 +56,7 @@ impl Standing {
         next_event: Tag::NEVER,
         granted: Tag::NEVER,
         provisional: Tag::NEVER,
+        runs_ahead: false,
     };
 
     /// Whether a grant tells the federate anything that earlier ones have not.
@@ -220,6 +223,7 @@ pub fn tag_advance_grant(view: &View<'_>, federate: FederateId) -> Option<Grant>
         .filter(|&grant| standing.admits(grant))
         .or_else(|| provisional_grant(view, federate).filter(|&grant| standing.admits(grant)))
         .or_else(|| demanded_grant(view, federate))
+        .or_else(|| grant_ahead(view, federate).filter(|&grant| standing.admits(grant)))
 }
 
 /// What the PTAGs under way demand of `federate` and was not possible when they were sent.
@@ -234,6 +238,16 @@ fn demanded_grant(view: &View<'_>, federate: FederateId) -> Option<Grant> {
             .then(|| fan_out_grant(view, federate, tag))
             .flatten()
     })
+}
+
+/// The tag before a federate's NET, when messages may still come at the NET itself: what needs no input can run then.
+///
+/// An extension; LF's RTI leaves such a federate without a grant until all that is upstream has passed the tag.
+fn grant_ahead(view: &View<'_>, federate: FederateId) -> Option<Grant> {
+    let standing = &view.standings[federate.index()];
+    let next = standing.next_event;
+    let due = standing.runs_ahead && next > Tag::NEVER && view.earliest_incoming(federate) == next;
+    due.then(|| Grant::Full(before(view, next)))
 }
 
 /// The larger of what LTCs and what NETs allow, provided that it reaches the federate's own NET.

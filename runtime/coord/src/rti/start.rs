@@ -7,7 +7,9 @@ use ictus_core::{Delay, Duration, LogicalTime, PhysicalTime, Tag};
 use super::{ConnectionId, Link, Phase, Rti, RtiEvent, Stage};
 use crate::mutants::Mutant;
 use crate::topology::{FederateId, Topology};
-use crate::wire::{NO_CLOCK_SYNC, NeighborStructure, RejectReason, ToFederate, ToRti, kind};
+use crate::wire::{
+    NO_CLOCK_SYNC, NeighborStructure, RejectReason, ToFederate, ToRti, capability, kind,
+};
 
 /// The most that the start time lies after the latest proposal; LF's constant.
 const LONGEST_DELAY: Duration = Duration::from_secs(1);
@@ -180,6 +182,7 @@ impl Rti {
     fn take_capabilities(&mut self, federate: FederateId, capabilities: u32) {
         let member = &mut self.members[federate.index()];
         member.capabilities = Some(capabilities);
+        self.standings[federate.index()].runs_ahead = capabilities & capability::RUNS_AHEAD != 0;
         if let Some(id) = member.connection {
             self.connections[id.0].output.allow_large_chunks();
         }

@@ -23,8 +23,8 @@ fn tag() -> impl Strategy<Value = Tag> {
 }
 
 fn standing() -> impl Strategy<Value = Standing> {
-    (tag(), tag(), tag(), tag(), 0..8u8).prop_map(|(a, b, granted, provisional, presence)| {
-        let presence = match presence {
+    (tag(), tag(), tag(), tag(), 0..16u8).prop_map(|(a, b, granted, provisional, kind)| {
+        let presence = match kind % 8 {
             0 => Presence::Resigned,
             1 => Presence::Lost,
             _ => Presence::Present,
@@ -40,6 +40,7 @@ fn standing() -> impl Strategy<Value = Standing> {
             next_event,
             granted,
             provisional,
+            runs_ahead: kind >= 8,
         }
     })
 }
