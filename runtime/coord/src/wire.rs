@@ -127,8 +127,8 @@ pub mod capability {
     pub const FLOW_CONTROL: u32 = 1;
     /// The federate understands [`super::ToFederate::FederateLost`].
     pub const FEDERATE_LOST: u32 = 2;
-    /// The federate has reactions that no network input can reach at the same tag: a TAG just before its NET, when messages
-    /// may still come at it, lets them run.
+    /// The federate begins a tag as soon as nothing can come before it, and runs there what has all its inputs: it wants a
+    /// TAG just before its NET when messages may still come at its NET.
     pub const RUNS_AHEAD: u32 = 4;
 }
 

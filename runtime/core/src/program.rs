@@ -734,27 +734,6 @@ impl Program {
         false
     }
 
-    /// Whether something that happens here alone, a timer or an action, triggers a node that no network input can reach
-    /// at the same tag: it may run before those inputs are known.
-    #[must_use]
-    pub fn runs_ahead_of_inputs(&self) -> bool {
-        let Some(relations) = &self.relations else {
-            return false;
-        };
-        let mut actions = self.actions.iter().zip(&self.action_triggers);
-        actions.any(|(kind, triggered)| {
-            let local = match kind {
-                ActionKind::Timer { .. }
-                | ActionKind::Logical { .. }
-                | ActionKind::Physical { .. }
-                | ActionKind::Connection { .. } => true,
-                ActionKind::Startup | ActionKind::Shutdown | ActionKind::Network { .. } => false,
-            };
-            let free = |node: &NodeId| relations.cone[node.index()].is_empty();
-            local && triggered.iter().any(free)
-        })
-    }
-
     /// The least minimum delay over all physical actions, or `None` when there is none.
     #[must_use]
     pub fn least_physical_delay(&self) -> Option<Duration> {

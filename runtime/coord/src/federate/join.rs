@@ -166,11 +166,9 @@ impl Federate {
             NO_CLOCK_SYNC
         }));
         if link.config.extensions {
-            let mut capabilities = capability::FLOW_CONTROL | capability::FEDERATE_LOST;
-            if link.runs_ahead() {
-                capabilities |= capability::RUNS_AHEAD;
-            }
-            link.say(&ToRti::Capabilities(capabilities));
+            link.say(&ToRti::Capabilities(
+                capability::FLOW_CONTROL | capability::FEDERATE_LOST | capability::RUNS_AHEAD,
+            ));
         }
         match exchanges {
             Some(wanted) if wanted > 0 => {

@@ -153,8 +153,6 @@ pub(super) struct Link {
     /// Per sender node: the tag at which its output was last sent or said to be absent.
     told_at: Vec<Tag>,
     senders: Vec<(NodeId, OutputId)>,
-    /// The program has reactions that need no network input.
-    runs_ahead: bool,
     unconfirmed: VecDeque<Sent>,
     /// The last tag that had to wait for downstreams, and how many had to.
     held_back: Tag,
@@ -197,7 +195,6 @@ impl Link {
             last_confirmed: Tag::NEVER,
             told_at: vec![Tag::NEVER; nodes],
             senders,
-            runs_ahead: program.runs_ahead_of_inputs() && config.extensions,
             unconfirmed: VecDeque::new(),
             held_back: Tag::NEVER,
             held_back_count: 0,
@@ -214,10 +211,6 @@ impl Link {
 
     pub(super) fn in_cycle(&self) -> bool {
         self.config.in_cycle
-    }
-
-    pub(super) const fn runs_ahead(&self) -> bool {
-        self.runs_ahead
     }
 
     pub(super) fn skipped(&self) -> u64 {
@@ -296,10 +289,10 @@ impl Link {
         }
     }
 
-    /// The grant that `next` needs. Reactions that no network input reaches run as soon as nothing can come before it;
-    /// the others of that tag wait for its own grant.
+    /// The grant that `next` needs to be begun. What has its inputs at it, because they are there or because it has none, runs
+    /// as soon as nothing can come before it; the rest, and its end, wait for its own grant.
     fn enough(&self, next: Tag) -> Tag {
-        if self.runs_ahead && next != Tag::FOREVER {
+        if self.config.extensions && next != Tag::FOREVER {
             next.latest_earlier()
         } else {
             next
@@ -308,7 +301,7 @@ impl Link {
 
     /// Whether `at` is executed without having been granted.
     pub(super) fn is_ahead(&self, at: Tag) -> bool {
-        self.runs_ahead
+        self.config.extensions
             && !self.config.upstream.is_empty()
             && self.granted < at
             && !self.config.mutants.has(Mutant::AheadCompletes)

@@ -44,7 +44,7 @@ pub struct Standing {
     pub granted: Tag,
     /// The last PTAG sent to it.
     pub provisional: Tag,
-    /// Whether part of a tag can be executed there before its inputs are known at it (capability RUNS_AHEAD).
+    /// Whether it begins a tag before all its inputs are known at it (capability RUNS_AHEAD).
     pub runs_ahead: bool,
 }
 
@@ -240,7 +240,7 @@ fn demanded_grant(view: &View<'_>, federate: FederateId) -> Option<Grant> {
     })
 }
 
-/// The tag before a federate's NET, when messages may still come at the NET itself: what needs no input can run then.
+/// The tag before a federate's NET, when messages may still come at the NET itself: what has its inputs can run then.
 ///
 /// An extension; LF's RTI leaves such a federate without a grant until all that is upstream has passed the tag.
 fn grant_ahead(view: &View<'_>, federate: FederateId) -> Option<Grant> {
