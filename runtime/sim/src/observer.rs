@@ -498,7 +498,9 @@ impl Observer {
         if ahead {
             self.coverage.hit(Feature::RunsAhead);
         }
-        if position.at > granted && !shutdown_only && !ahead {
+        // What it waits for there may be lost: it ends the tag it is at as far as it can.
+        let abandoned = seen.entered_before_loss == Some(position.at);
+        if position.at > granted && !shutdown_only && !ahead && !abandoned {
             let what = format!(
                 "federate {federate} ran {} but was granted {granted}",
                 position.at
