@@ -146,6 +146,31 @@ ictus::program![A, Worker, D];
 #[cfg(test)]
 mod tests {
     use super::*;
+    use ictus::simulate::Federation;
+    use serde_json::json;
+
+    #[test]
+    fn every_network_gives_the_trace_of_one_process() {
+        for half in [0.ms(), 5.ms()] {
+            let work = json!({"work": "0 ms"});
+            let worker = |seed: u64| json!({"seed": seed, "max_work": "0 ms"});
+            let federation = Federation::new()
+                .federate::<A>("a", work.clone())
+                .federate::<Worker>("b", worker(1))
+                .federate::<Worker>("c", worker(2))
+                .federate::<D>("d", work)
+                .connect("a.alpha", "b.input", Some(half))
+                .connect("a.beta", "c.input", Some(half))
+                .connect("b.out", "d.gamma", Some(half))
+                .connect("c.out", "d.delta", Some(half))
+                .timeout(1.secs());
+            let alone = federation.alone().unwrap();
+            assert_eq!(alone.of("d").count(), 2 * 10 + 1, "{alone}");
+            for seed in 0..30 {
+                assert_eq!(federation.simulate(seed).unwrap(), alone, "seed {seed}");
+            }
+        }
+    }
 
     #[test]
     fn random_times_are_uniform_and_repeat() {

@@ -97,6 +97,22 @@ impl Topology {
         topology
     }
 
+    /// The topology of a plan's connections between different federates.
+    #[must_use]
+    pub fn of_plan(plan: &Plan) -> Self {
+        let remote = |c: &&ConnectionPlan| c.from.federate != c.to.federate;
+        Self::new(
+            plan.federates.len(),
+            plan.connections.iter().filter(remote).map(|c| {
+                (
+                    FederateId::new(c.from.federate),
+                    FederateId::new(c.to.federate),
+                    connection_delay(c),
+                )
+            }),
+        )
+    }
+
     /// The topology that federates have told the RTI, in order of their ids: their *upstream* lists count.
     #[must_use]
     pub fn from_neighbors(neighbors: &[NeighborStructure]) -> Self {

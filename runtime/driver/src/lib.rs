@@ -252,6 +252,8 @@ mod port;
 mod reactor;
 mod run;
 mod scope;
+#[cfg(feature = "simulate")]
+pub mod simulate;
 mod slot;
 mod status;
 mod transport;

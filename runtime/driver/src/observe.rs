@@ -15,7 +15,6 @@ pub struct Observation {
 }
 
 /// Writes the files of all federates of the process. The first error stays until the end.
-#[derive(Debug)]
 pub(crate) struct Observer {
     federates: Vec<Files>,
     /// By reactor id: index into `federates`.
@@ -23,11 +22,10 @@ pub(crate) struct Observer {
     failure: Option<io::Error>,
 }
 
-#[derive(Debug)]
 struct Files {
     name: String,
-    trace: Option<BufWriter<File>>,
-    timing: Option<BufWriter<File>>,
+    trace: Option<Box<dyn Write>>,
+    timing: Option<Box<dyn Write>>,
 }
 
 /// One run of a reaction.
@@ -51,6 +49,29 @@ impl Observer {
         if trace.is_none() && timing.is_none() {
             return Ok(None);
         }
+        Self::with(program, |name| {
+            Ok(Files {
+                name: name.to_owned(),
+                trace: create(trace.as_deref(), name, "trace")?,
+                timing: create(timing.as_deref(), name, "timing")?,
+            })
+        })
+        .map(Some)
+    }
+
+    /// Keeps the traces of all federates in memory, one after the other record by record.
+    #[cfg(feature = "simulate")]
+    pub(crate) fn in_memory(program: &Program, memory: &Memory) -> Self {
+        let files = |name: &str| Files {
+            name: name.to_owned(),
+            trace: Some(Box::new(memory.clone())),
+            timing: None,
+        };
+        let opened = Self::with(program, |name| Ok(files(name)));
+        opened.unwrap_or_else(|_| unreachable!("memory opens"))
+    }
+
+    fn with(program: &Program, open: impl Fn(&str) -> io::Result<Files>) -> io::Result<Self> {
         let mut federates: Vec<Files> = Vec::new();
         let mut federate_of = Vec::new();
         for path in program.reactor_paths() {
@@ -58,18 +79,14 @@ impl Observer {
             let known = federates.iter().position(|f| f.name == name);
             federate_of.push(known.unwrap_or(federates.len()));
             if known.is_none() {
-                federates.push(Files {
-                    name: name.to_owned(),
-                    trace: create(trace.as_deref(), name, "trace")?,
-                    timing: create(timing.as_deref(), name, "timing")?,
-                });
+                federates.push(open(name)?);
             }
         }
-        Ok(Some(Self {
+        Ok(Self {
             federates,
             federate_of,
             failure: None,
-        }))
+        })
     }
 
     pub(crate) fn run(&mut self, run: &Run<'_>) {
@@ -105,12 +122,12 @@ impl Observer {
         });
         self.keep(result);
         let timings = self.federates.iter_mut().filter_map(|f| f.timing.as_mut());
-        let result = { timings }.try_for_each(Write::flush);
+        let result = { timings }.try_for_each(|timing| timing.flush());
         self.keep(result);
         self.failure.map_or(Ok(()), Err)
     }
 
-    fn traces(&mut self) -> impl Iterator<Item = &mut BufWriter<File>> {
+    fn traces(&mut self) -> impl Iterator<Item = &mut Box<dyn Write>> {
         self.federates.iter_mut().filter_map(|f| f.trace.as_mut())
     }
 
@@ -159,8 +176,35 @@ fn create(
     directory: Option<&Path>,
     federate: &str,
     extension: &str,
-) -> io::Result<Option<BufWriter<File>>> {
-    let path = directory.map(|directory| directory.join(format!("{federate}.{extension}")));
-    path.map(|path| File::create(path).map(BufWriter::new))
-        .transpose()
+) -> io::Result<Option<Box<dyn Write>>> {
+    let Some(directory) = directory else {
+        return Ok(None);
+    };
+    let file = File::create(directory.join(format!("{federate}.{extension}")))?;
+    Ok(Some(Box::new(BufWriter::new(file))))
+}
+
+/// Bytes that outlive the observer that wrote them.
+#[cfg(feature = "simulate")]
+#[derive(Clone, Debug, Default)]
+pub(crate) struct Memory(std::rc::Rc<std::cell::RefCell<Vec<u8>>>);
+
+#[cfg(feature = "simulate")]
+impl Memory {
+    /// What was written so far.
+    pub(crate) fn text(&self) -> String {
+        String::from_utf8_lossy(&self.0.borrow()).into_owned()
+    }
+}
+
+#[cfg(feature = "simulate")]
+impl Write for Memory {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        self.0.borrow_mut().extend_from_slice(bytes);
+        Ok(bytes.len())
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        Ok(())
+    }
 }

@@ -7,14 +7,22 @@ use crate::reference::OutsideEvent;
 use crate::seed::mix;
 use ictus_coord::{FederateExecutor, PayloadError};
 use ictus_core::{
-    ActionId, Duration, Effects, Executor, InputId, NodeId, NodeKind, OutputId, Scheduled, SlotId,
-    Tag, ValueId,
+    ActionId, Duration, Effects, Executor, InputId, NodeId, NodeKind, OutputId, PhysicalTime,
+    Scheduled, SlotId, Tag, ValueId,
 };
 
 /// What the simulated world asks of an executor beyond coordination.
 pub trait SimulatedExecutor: FederateExecutor {
     /// Learns the start tag.
     fn started(&mut self, start: Tag);
+
+    /// Learns what its host's clock reads.
+    fn reads_clock(&mut self, _now: PhysicalTime) {}
+
+    /// Whether a reaction has failed, so that the federate must.
+    fn failed(&self) -> bool {
+        false
+    }
 
     /// Makes the value of an event from outside, and names the physical action; `None` when there is no such action.
     fn outside(&mut self, draw: u64) -> Option<(ActionId, ValueId)>;

@@ -1,7 +1,8 @@
 //! A separate observer of every byte between federates and the RTI. It knows the truth and trusts nobody.
 
 use crate::coverage::{Coverage, Feature};
-use ictus_coord::topology::{FederateId, Topology};
+use ictus_coord::plan::Plan;
+use ictus_coord::topology::{FederateId, Topology, connection_delay};
 use ictus_coord::wire::{TaggedMessage, ToFederate, ToRti};
 use ictus_core::{Delay, Tag};
 use std::collections::BTreeMap;
@@ -92,9 +93,14 @@ pub struct Observer {
 }
 
 impl Observer {
-    /// An observer of a federation; `delays` names the delay of each (receiver, port).
+    /// An observer of a plan's federation.
     #[must_use]
-    pub fn new(topology: Topology, delays: BTreeMap<(u16, u16), Delay>) -> Self {
+    pub fn of_plan(plan: &Plan) -> Self {
+        let topology = Topology::of_plan(plan);
+        let connections = plan.connections.iter();
+        let delays = connections
+            .map(|c| ((c.to.federate, c.port_id), connection_delay(c)))
+            .collect();
         Self {
             seen: std::iter::repeat_with(Seen::default)
                 .take(topology.len())

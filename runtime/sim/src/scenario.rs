@@ -10,9 +10,8 @@ use crate::swarm::{Ending, Swarm};
 use crate::world::{Conditions, Ended, Member, Run, Victim, World};
 use ictus_coord::federate::{FederateConfig, LinkConfig, Outcome};
 use ictus_coord::mutants::Mutants;
-use ictus_coord::topology::{FederateId, Topology, connection_delay};
+use ictus_coord::topology::{FederateId, Topology};
 use ictus_core::{Delay, Duration, Tag};
-use std::collections::BTreeMap;
 
 /// What a seed showed.
 #[derive(Debug)]
@@ -95,12 +94,7 @@ pub fn simulate(
     log: bool,
 ) -> Run<SyntheticExecutor> {
     let plan = federation.plan();
-    let topology = remote_topology(federation);
-    let delays = plan
-        .connections
-        .iter()
-        .map(|c| ((c.to.federate, c.port_id), connection_delay(c)))
-        .collect::<BTreeMap<_, _>>();
+    let topology = Topology::of_plan(&plan);
     let legacy = legacy_sources(&topology, swarm);
     let payload = if rng.fork(9).percent(10) { 3_000 } else { 0 };
     let members = (0..federation.federates.len()).map(|id| {
@@ -126,22 +120,11 @@ pub fn simulate(
         },
         mutants,
     };
-    let mut observer = Observer::new(topology, delays);
+    let mut observer = Observer::of_plan(&plan);
     observer.log = log.then(String::new);
     observer.physical = swarm.shape.physical;
     observer.extensions = swarm.mode.extensions;
     World::new(members.collect(), observer, conditions, rng).run()
-}
-
-fn remote_topology(federation: &Federation) -> Topology {
-    let remote = federation.links.iter().filter(|l| l.from.0 != l.to.0);
-    Topology::new(
-        federation.federates.len(),
-        remote.map(|l| {
-            let id = FederateId::from_index;
-            (id(l.from.0), id(l.to.0), l.delay)
-        }),
-    )
 }
 
 /// The federates that may announce by LTC alone: they have no upstream, and whoever hears from them hears from no others
@@ -435,7 +418,7 @@ fn hash(run: &Run<SyntheticExecutor>) -> u64 {
 
 /// Counts what follows from the structure alone.
 fn cover_structure(federation: &Federation, coverage: &mut Coverage, swarm: &Swarm) {
-    let topology = remote_topology(federation);
+    let topology = Topology::of_plan(&federation.plan());
     let ids: Vec<FederateId> = topology.federates().collect();
     let in_zero_delay_cycle = |f: &FederateId| topology.in_zero_delay_cycle(*f);
     let apart = ids.iter().filter(|f| in_zero_delay_cycle(f)).any(|a| {

@@ -1,7 +1,7 @@
 //! The link to the RTI under centralized coordination: what is announced (NET, LTC), granted (TAG, PTAG) and sent.
 
 use crate::mutants::{Mutant, Mutants};
-use crate::plan::{ClockSync, ConnectionPlan, Plan};
+use crate::plan::{ClockSync, Plan};
 use crate::topology::{FederateId, Topology, connection_delay, zero_delay_cycle_inputs};
 use crate::wire::{self, NeighborStructure, PortAbsent, ToRti};
 use ictus_core::{
@@ -58,17 +58,7 @@ impl LinkConfig {
     /// When an index is not of the plan.
     #[must_use]
     pub fn from_plan(plan: &Plan, id: u16, inputs: &[usize], outputs: &[usize]) -> Self {
-        let remote = |c: &&ConnectionPlan| c.from.federate != c.to.federate;
-        let topology = Topology::new(
-            plan.federates.len(),
-            plan.connections.iter().filter(remote).map(|c| {
-                (
-                    FederateId::new(c.from.federate),
-                    FederateId::new(c.to.federate),
-                    connection_delay(c),
-                )
-            }),
-        );
+        let topology = Topology::of_plan(plan);
         let me = FederateId::new(id);
         let neighbors = topology.neighbor_structure(me);
         let in_cycle = zero_delay_cycle_inputs(plan, &topology, me);

@@ -16,5 +16,7 @@ mod hierarchy;
 mod observing;
 mod physical;
 mod ports;
+#[cfg(feature = "simulate")]
+mod simulating;
 mod time;
 mod values;

@@ -257,6 +257,7 @@ impl<E: SimulatedExecutor> World<E> {
         loop {
             let host = &mut self.hosts[federate];
             let now = host.clock.reading(self.now);
+            host.executor.reads_clock(now);
             match host.federate.poll(now, &mut host.executor) {
                 Poll::Run => {
                     if !self.start_batch(federate) {
@@ -334,6 +335,9 @@ impl<E: SimulatedExecutor> World<E> {
             return true;
         }
         host.federate.run_batch(&mut host.executor);
+        if host.executor.failed() {
+            host.federate.fail();
+        }
         let takes = host.rng.span(Duration::ZERO, mode.reaction).as_nanos();
         if takes > 0 {
             host.busy_until = self.now + takes;
