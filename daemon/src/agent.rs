@@ -21,7 +21,7 @@ mod stop;
 use member::{Member, Process};
 
 /// The RTI's name among the members.
-pub const RTI: &str = "rti";
+pub const RTI: &str = ictus_deploy::COORDINATOR;
 /// How long after the last join the start may take: start consensus and the first tag.
 const FIRST_TAG_MAX: Duration = Duration::from_secs(60);
 /// Refused connections that are told: who floods the RTI's port must not flood who watches.

@@ -54,7 +54,7 @@ pub(crate) const CODES: &[(&str, &str)] = &[
     (
         "F008",
         "Names of federations, programs, federates, ports and parameters are a letter followed by \
-         letters, digits, `_` or `-`, at most 64 in all: they become file names and parts of paths.",
+         letters, digits, `_` or `-`, at most 64 in all: they become file names and parts of paths. No federate is called `rti`: that is the coordinator.",
     ),
     (
         "F009",

@@ -25,5 +25,6 @@ pub use check::{
     CheckOptions, Checked, FederateKind, FederateRun, Progress, Settings, check, schema,
 };
 pub use codes::explain;
+pub use manifest::COORDINATOR;
 pub use problem::{Problem, Problems};
 pub use timing::TimingSpec;

@@ -461,6 +461,9 @@ impl<'de> Deserialize<'de> for ByteSize {
     }
 }
 
+/// The name under which logs, events and exits speak of the RTI; no federate has it.
+pub const COORDINATOR: &str = "rti";
+
 /// Whether a text can be the name of a federate, program, port or parameter.
 pub(crate) fn is_name(text: &str) -> bool {
     let mut bytes = text.bytes();

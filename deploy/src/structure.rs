@@ -6,7 +6,7 @@ use std::collections::BTreeMap;
 use serde_json::Value as Json;
 
 use crate::document::{Key, Node, Part, Value};
-use crate::manifest::is_name;
+use crate::manifest::{COORDINATOR, is_name};
 use crate::problem::{Place, Report};
 use crate::{quantity, suggest};
 
@@ -142,11 +142,20 @@ impl<'a> Walker<'a> {
     }
 
     fn name(&mut self, schema: &Json, name: &str) -> bool {
-        if schema.get("propertyNames").is_none() || is_name(name) {
+        if schema.get("propertyNames").is_none() {
             return true;
         }
-        let message = format!("`{name}` cannot be a name");
-        let fix = "a name is a letter, then letters, digits, `_` or `-`; at most 64";
+        let taken = self.path.len() == 2 && self.path[0] == "federates" && name == COORDINATOR;
+        let (message, fix) = if taken {
+            let message = format!("`{name}` stands for the coordinator");
+            (message, "give the federate another name")
+        } else if !is_name(name) {
+            let message = format!("`{name}` cannot be a name");
+            let fix = "a name is a letter, then letters, digits, `_` or `-`; at most 64";
+            (message, fix)
+        } else {
+            return true;
+        };
         self.report
             .add("F008", Place::new(&self.path, Part::Key), message, fix);
         false
