@@ -111,6 +111,23 @@ fn the_diamond_keeps_its_order_for_every_delay() {
 }
 
 #[test]
+fn the_timing_of_a_running_federation_can_be_read() {
+    let sandbox = Sandbox::new();
+    sandbox.ok(&["up", DIAMOND, "--set", "run=1 h"]);
+    // What a federate reports as progress stands in its files.
+    let behind = |view: &Value| {
+        let mut federates = view["federates"].as_array().unwrap().iter();
+        federates.any(|f| f["tags"].as_u64().unwrap_or(0) < 5)
+    };
+    while behind(&sandbox.view("diamond")) {}
+    let report = sandbox.json(&["timing", "diamond"]);
+    let run = &report["end_to_end"][0]["runs"][0];
+    assert!(run["full"]["count"].as_u64().unwrap() >= 3, "{report}");
+    assert_eq!(run["missing"], 0, "{report}");
+    sandbox.ok(&["down", "diamond", "--purge"]);
+}
+
+#[test]
 fn a_killed_federate_stops_the_federation_in_order() {
     let sandbox = Sandbox::new();
     sandbox.ok(&["up", DIAMOND]);

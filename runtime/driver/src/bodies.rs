@@ -121,6 +121,13 @@ impl Bodies {
         }
     }
 
+    /// Lets readers of the trace and timing files see what was written so far.
+    pub fn flush_observed(&mut self) {
+        if let Some(observer) = &mut self.observer {
+            observer.flush();
+        }
+    }
+
     /// Ends and flushes trace and timing: the last completed tag and why (one line).
     ///
     /// # Errors

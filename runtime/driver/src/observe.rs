@@ -113,6 +113,14 @@ impl Observer {
         self.keep(result);
     }
 
+    /// Lets readers of a running federation see what was written so far.
+    pub(crate) fn flush(&mut self) {
+        let files = self.federates.iter_mut();
+        let writers = files.flat_map(|f| f.trace.iter_mut().chain(&mut f.timing));
+        let result = { writers }.try_for_each(|writer| writer.flush());
+        self.keep(result);
+    }
+
     pub(crate) fn end(mut self, origin: Tag, tag: Tag, reason: &str) -> io::Result<()> {
         let (time, microstep) = (tag.time.since(origin.time).as_nanos(), tag.microstep);
         let reason = reason.replace(['\n', '\r'], " ");

@@ -37,7 +37,7 @@ const STEPS_PER_LOOK: u32 = 64;
 const CONNECT_FOR: Duration = Duration::from_secs(60);
 /// How long the RTI may take to close after RESIGN or FAILED.
 const DRAIN_FOR: Duration = Duration::from_secs(5);
-/// How often progress is reported.
+/// How often progress is reported, and trace and timing files are brought up to date.
 const PROGRESS_EVERY: Duration = Duration::from_secs(1);
 
 /// The `main` of a program that has these classes; [`program!`](crate::program) writes the call.
@@ -431,6 +431,7 @@ impl Runner<'_> {
             return;
         }
         self.reported_at = now;
+        self.bodies.flush_observed();
         if self.start == Tag::NEVER {
             return;
         }
