@@ -67,8 +67,11 @@ pub struct RtiConfig {
     pub dnet: bool,
     /// The start time is rounded up to a multiple of this.
     pub start_multiple: Option<Duration>,
-    /// How long a connection may take to say who it is.
+    /// How long a connection may take to say who it is, and then to say each next thing up to the last clock exchange.
     pub handshake_timeout: Duration,
+    /// How long a federate that has done its clock exchanges may then be silent before it proposes a start time: it may
+    /// be connecting to its peers, for which a C federate gives itself a minute.
+    pub setup_timeout: Duration,
     /// How long a connection that is to close may take to take its bytes and close.
     pub closing_timeout: Duration,
     /// How long federates may take to answer a stop request before those that are missing are named; when a federate
@@ -88,8 +91,8 @@ pub struct RtiConfig {
 }
 
 impl RtiConfig {
-    /// The defaults for a federation of `federates` federates: no clock exchanges, DNET on, handshakes of 30 s, 64 MiB
-    /// payloads, 256 MiB per output.
+    /// The defaults for a federation of `federates` federates: no clock exchanges, DNET on, handshakes of 30 s, 180 s
+    /// to set up, 64 MiB payloads, 256 MiB per output.
     #[must_use]
     pub fn new(federation: &str, federates: u16) -> Self {
         Self {
@@ -99,6 +102,7 @@ impl RtiConfig {
             dnet: true,
             start_multiple: None,
             handshake_timeout: Duration::from_secs(30),
+            setup_timeout: Duration::from_secs(180),
             closing_timeout: Duration::from_secs(5),
             stop_reply_timeout: Duration::from_secs(30),
             stop_grace: Duration::from_secs(10),
@@ -268,6 +272,8 @@ enum Link {
 struct Member {
     stage: Stage,
     connection: Option<ConnectionId>,
+    /// When it last said something while joining.
+    last_word: PhysicalTime,
     /// CAPABILITIES, once it has sent them.
     capabilities: Option<u32>,
     neighbors: NeighborStructure,
@@ -540,6 +546,7 @@ impl Member {
         Self {
             stage: Stage::Absent,
             connection: None,
+            last_word: PhysicalTime::NEVER,
             capabilities: None,
             neighbors: NeighborStructure {
                 upstream: Vec::new(),

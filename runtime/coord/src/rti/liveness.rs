@@ -1,6 +1,6 @@
 //! Leaving, being lost, and deadlines: nobody is ever left hanging.
 
-use ictus_core::{PhysicalTime, Tag};
+use ictus_core::{Duration, PhysicalTime, Tag};
 
 use super::grant::{LostRule, Presence, promise_over};
 use super::stop::Stop;
@@ -56,7 +56,8 @@ impl Rti {
                 Link::Closing { deadline, .. } if connection.output.closing() != Closing::Now => {
                     Some(deadline)
                 }
-                Link::Closing { .. } | Link::Free | Link::Member(_) => None,
+                Link::Member(federate) => self.joining_deadline(federate),
+                Link::Closing { .. } | Link::Free => None,
             })
             .chain(self.stop_deadline())
             .chain(self.grace_deadline())
@@ -76,7 +77,38 @@ impl Rti {
                 self.connections[id.0].output.close(Closing::Now);
                 self.queue_output(id);
             }
-            Link::Unknown { .. } | Link::Closing { .. } | Link::Free | Link::Member(_) => {}
+            Link::Member(federate) => self.check_joining(federate),
+            Link::Unknown { .. } | Link::Closing { .. } | Link::Free => {}
+        }
+    }
+
+    fn check_joining(&mut self, federate: FederateId) {
+        let late = self.joining_deadline(federate);
+        if late.is_none_or(|deadline| deadline > self.now) {
+            return;
+        }
+        let silent = self.joining_patience(federate).unwrap_or_default();
+        self.fail(
+            federate,
+            format!("it said nothing for {silent} while joining"),
+        );
+    }
+
+    /// When a federate that is joining must have said its next word.
+    fn joining_deadline(&self, federate: FederateId) -> Option<PhysicalTime> {
+        let patience = self.joining_patience(federate)?;
+        Some(self.members[federate.index()].last_word + patience)
+    }
+
+    /// How long a federate may be silent as far as its join is. One that has proposed a start time waits for others, not
+    /// they for it.
+    fn joining_patience(&self, federate: FederateId) -> Option<Duration> {
+        match self.members[federate.index()].stage {
+            Stage::Identified | Stage::Structured | Stage::Exchanging { .. } => {
+                Some(self.config.handshake_timeout)
+            }
+            Stage::Synchronized { .. } => Some(self.config.setup_timeout),
+            Stage::Absent | Stage::Proposed { .. } | Stage::Running | Stage::Gone => None,
         }
     }
 

@@ -86,6 +86,7 @@ impl Rti {
         let member = &mut self.members[federate.index()];
         member.connection = Some(id);
         member.stage = Stage::Identified;
+        member.last_word = self.now;
         self.send_to(id, &ToFederate::Ack);
     }
 
@@ -105,6 +106,7 @@ impl Rti {
     }
 
     fn handle_joining(&mut self, federate: FederateId, message: ToRti<'_>) {
+        self.members[federate.index()].last_word = self.now;
         match (self.members[federate.index()].stage, message) {
             (Stage::Identified, ToRti::NeighborStructure(neighbors)) => {
                 self.take_structure(federate, neighbors);
