@@ -10,6 +10,7 @@ use std::process::ExitCode;
 use ictus_coord::report::exit;
 
 pub mod options;
+mod outlet;
 mod server;
 mod socket;
 pub mod status;

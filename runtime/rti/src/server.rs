@@ -19,8 +19,9 @@ const LISTENER: Token = Token(usize::MAX);
 const SIGNALS: Token = Token(usize::MAX - 1);
 /// Connections that have not said who they are, beyond those of the federates.
 const STRANGERS: usize = 256;
-/// When accepting fails (no descriptor is left), it is tried again after this long.
-const ACCEPT_AGAIN: Duration = Duration::from_millis(100);
+/// When accepting fails (no descriptor is left), or a reader of what the RTI says of itself is behind, it is tried again
+/// after this long.
+const TRY_AGAIN: Duration = Duration::from_millis(100);
 
 /// An RTI with its sockets.
 #[derive(Debug)]
@@ -159,7 +160,7 @@ impl Server {
             self.write_round(&woken);
             self.report();
             if let Some(code) = self.rti.finished() {
-                self.status.flush();
+                self.status.finish();
                 return Ok(code);
             }
         }
@@ -170,12 +171,13 @@ impl Server {
         if self.sockets.iter().flatten().any(|socket| socket.readable) {
             return Some(Duration::ZERO);
         }
-        let accept = (self.accepting && self.listener.is_some()).then_some(ACCEPT_AGAIN);
+        let accepting = self.accepting && self.listener.is_some();
+        let again = (accepting || self.status.is_behind()).then_some(TRY_AGAIN);
         let deadline = self
             .rti
             .poll_timeout()
             .map(|deadline| deadline.since(physical_time()).to_std() + Duration::from_millis(1));
-        match (accept, deadline) {
+        match (again, deadline) {
             (Some(a), Some(b)) => Some(a.min(b)),
             (a, b) => a.or(b),
         }

@@ -1,23 +1,27 @@
 //! What the RTI says of itself: status lines for supervisors, words for people.
 
-use std::fs::{File, OpenOptions};
-use std::io::{self, Write};
-use std::os::unix::fs::OpenOptionsExt;
+use std::fs::File;
+use std::io;
+use std::time::{Duration, Instant};
 
 use ictus_coord::report::RtiStatus;
 use ictus_coord::rti::RtiEvent;
 use ictus_core::PhysicalTime;
-use rustix::fs::OFlags;
 
-/// Past this many unwritten bytes, lines about refused connections are left out.
+use crate::outlet::Outlet;
+
+/// Past this many unwritten bytes, lines about refused connections, and words, are left out.
 const BACKLOG: usize = 1 << 20;
+/// How long the end waits for readers that are behind.
+const LAST_WORDS: Duration = Duration::from_secs(2);
 
-/// Where status lines and words go. Writing never blocks.
+/// Where status lines and words go. Writing never blocks, but for a bounded time at the end.
 #[derive(Debug, Default)]
 pub struct Status {
-    lines: Option<File>,
-    unwritten: Vec<u8>,
-    words: bool,
+    lines: Option<Outlet>,
+    words: Option<Outlet>,
+    /// Words left out since the last that were not.
+    left_out: u64,
     start: Option<PhysicalTime>,
 }
 
@@ -38,10 +42,12 @@ impl Status {
     ///
     /// When the descriptor is not open for writing.
     pub fn open(descriptor: Option<u32>) -> Result<Self, StatusError> {
-        let lines = descriptor.map(open_descriptor).transpose()?;
+        let reopen = |descriptor| {
+            Outlet::reopen(descriptor).map_err(|source| StatusError { descriptor, source })
+        };
         Ok(Self {
-            lines,
-            words: true,
+            lines: descriptor.map(reopen).transpose()?,
+            words: Some(Outlet::stderr()),
             ..Self::default()
         })
     }
@@ -50,7 +56,7 @@ impl Status {
     #[must_use]
     pub fn to_file(lines: Option<File>) -> Self {
         Self {
-            lines,
+            lines: lines.map(Outlet::new),
             ..Self::default()
         }
     }
@@ -68,60 +74,78 @@ impl Status {
             self.start = Some(start);
         }
         match status_of(event) {
-            Some(RtiStatus::Rejected { .. }) if self.unwritten.len() > BACKLOG => {}
+            Some(RtiStatus::Rejected { .. }) if pending(self.lines.as_ref()) > BACKLOG => {}
             Some(status) => self.line(&status),
             None => {}
         }
     }
 
     /// Says something to people.
-    pub(crate) fn say(&self, words: &str) {
-        if self.words {
-            // Nobody is left to tell when standard error is gone.
-            let _unwritten = writeln!(io::stderr(), "ictus rti: {words}");
+    pub(crate) fn say(&mut self, words: &str) {
+        if pending(self.words.as_ref()) > BACKLOG {
+            self.left_out += 1;
+        } else if let Some(outlet) = &mut self.words {
+            tell_left_out(outlet, &mut self.left_out);
+            outlet.push(&format!("ictus rti: {words}"));
         }
+        self.flush();
     }
 
     fn line(&mut self, status: &RtiStatus) {
-        if self.lines.is_none() {
+        let Some(outlet) = &mut self.lines else {
             return;
-        }
+        };
         match serde_json::to_string(status) {
-            Ok(line) => {
-                self.unwritten.extend_from_slice(line.as_bytes());
-                self.unwritten.push(b'\n');
-            }
+            Ok(line) => outlet.push(&line),
             Err(error) => self.say(&format!("a status line cannot be written: {error}")),
         }
         self.flush();
     }
 
-    /// Writes what the descriptor takes now; a reader that is gone is forgotten.
+    /// Writes what the descriptors take now.
     pub(crate) fn flush(&mut self) {
-        let Some(file) = &mut self.lines else { return };
-        while !self.unwritten.is_empty() {
-            match file.write(&self.unwritten) {
-                Ok(written) => drop(self.unwritten.drain(..written)),
-                Err(error) if error.kind() == io::ErrorKind::Interrupted => {}
-                Err(error) if error.kind() == io::ErrorKind::WouldBlock => return,
-                Err(_) => {
-                    self.lines = None;
-                    self.unwritten.clear();
-                    return;
-                }
+        if let Some(outlet) = &mut self.lines {
+            outlet.flush();
+        }
+        if let Some(outlet) = &mut self.words {
+            outlet.flush();
+            if outlet.pending() == 0 && self.left_out > 0 {
+                tell_left_out(outlet, &mut self.left_out);
+                outlet.flush();
             }
         }
     }
+
+    /// Writes what is left, as far as it is taken within a bounded time.
+    pub(crate) fn finish(&mut self) {
+        let deadline = Instant::now() + LAST_WORDS;
+        self.flush();
+        if let Some(outlet) = &mut self.lines {
+            outlet.finish(deadline);
+        }
+        if let Some(outlet) = &mut self.words {
+            tell_left_out(outlet, &mut self.left_out);
+            outlet.finish(deadline);
+        }
+    }
+
+    /// Whether a reader is behind.
+    pub(crate) fn is_behind(&self) -> bool {
+        pending(self.lines.as_ref()) > 0 || pending(self.words.as_ref()) > 0
+    }
 }
 
-/// Opens the descriptor anew, so that non-blocking mode stays ours alone.
-fn open_descriptor(descriptor: u32) -> Result<File, StatusError> {
-    let flags = i32::try_from(OFlags::NONBLOCK.bits()).unwrap_or(0);
-    OpenOptions::new()
-        .write(true)
-        .custom_flags(flags)
-        .open(format!("/dev/fd/{descriptor}"))
-        .map_err(|source| StatusError { descriptor, source })
+fn pending(outlet: Option<&Outlet>) -> usize {
+    outlet.map_or(0, Outlet::pending)
+}
+
+fn tell_left_out(outlet: &mut Outlet, left_out: &mut u64) {
+    if *left_out > 0 {
+        outlet.push(&format!(
+            "ictus rti: {left_out} lines were left out here: nobody read"
+        ));
+        *left_out = 0;
+    }
 }
 
 fn words(event: &RtiEvent) -> String {
@@ -173,4 +197,59 @@ fn status_of(event: RtiEvent) -> Option<RtiStatus> {
         RtiEvent::Rejected { peer, reason } => RtiStatus::Rejected { peer, reason },
         RtiEvent::Ended { code } => RtiStatus::Ended { code },
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::io::Read;
+    use std::os::fd::OwnedFd;
+
+    #[test]
+    fn words_that_nobody_reads_block_nobody() {
+        let (mut reader, writer) = io::pipe().unwrap();
+        let mut status = Status {
+            words: Some(Outlet::new(File::from(OwnedFd::from(writer)))),
+            ..Status::default()
+        };
+        for number in 0..100_000 {
+            status.say(&format!("line {number:05}"));
+        }
+        assert!(status.is_behind());
+        let reading = std::thread::spawn(move || {
+            let mut text = String::new();
+            reader.read_to_string(&mut text).unwrap();
+            text
+        });
+        while status.is_behind() {
+            status.flush();
+        }
+        status.say("the end");
+        status.finish();
+        drop(status);
+        let text = reading.join().unwrap();
+        let lines: Vec<&str> = text.lines().collect();
+        let kept = lines.len() - 2;
+        for (number, line) in lines[..kept].iter().enumerate() {
+            assert_eq!(*line, format!("ictus rti: line {number:05}"));
+        }
+        let left_out = 100_000 - kept;
+        assert!(left_out > 0);
+        let told = format!("ictus rti: {left_out} lines were left out here: nobody read");
+        assert_eq!(lines[kept..], [told.as_str(), "ictus rti: the end"]);
+    }
+
+    #[test]
+    fn the_end_waits_for_a_reader_that_is_behind() {
+        let (mut reader, writer) = io::pipe().unwrap();
+        let mut status = Status::to_file(Some(File::from(OwnedFd::from(writer))));
+        while !status.is_behind() {
+            status.line(&RtiStatus::Ended { code: 0 });
+        }
+        let finishing = std::thread::spawn(move || status.finish());
+        let mut text = String::new();
+        reader.read_to_string(&mut text).unwrap();
+        finishing.join().unwrap();
+        assert!(text.ends_with('\n'));
+    }
 }
