@@ -92,6 +92,14 @@ pub enum Outcome {
     /// The RTI said FAILED.
     #[error("the RTI reported that the federation failed")]
     RtiFailed,
+    /// The RTI, or whoever listens at its address, did not answer while joining.
+    #[error("no answer for {} s while {phase}{hint}", join::ANSWER_MAX.as_nanos() / 1_000_000_000)]
+    NotJoined {
+        /// What was waited for.
+        phase: &'static str,
+        /// What may be the matter.
+        hint: &'static str,
+    },
     /// The RTI refused the join.
     #[error("the RTI refused the join: {0}")]
     Rejected(RejectReason),
@@ -168,6 +176,8 @@ pub struct Federate {
     timeline: Timeline,
     link: Option<Link>,
     phase: Phase,
+    /// When a step of joining must have been answered.
+    answer_by: Option<PhysicalTime>,
     batch: Vec<NodeId>,
     effects: Effects,
     present: Vec<(ActionId, ValueId)>,
@@ -199,6 +209,7 @@ impl Federate {
             config,
             link,
             phase: Phase::Idle,
+            answer_by: None,
             batch: Vec::new(),
             effects: Effects::default(),
             present: Vec::new(),
@@ -292,11 +303,9 @@ impl Federate {
         match self.phase {
             Phase::Running => self.poll_running(now, executor),
             Phase::Ended => Poll::Ended,
-            Phase::Idle
-            | Phase::AwaitingAck
-            | Phase::Synchronizing(_)
-            | Phase::AwaitingStart
-            | Phase::Draining => Poll::Wait(None),
+            Phase::AwaitingAck | Phase::Synchronizing(_) => self.await_answer(now),
+            // The others may join as late as they like.
+            Phase::Idle | Phase::AwaitingStart | Phase::Draining => Poll::Wait(None),
         }
     }
 

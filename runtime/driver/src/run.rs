@@ -543,13 +543,15 @@ impl Runner<'_> {
                 (exit::RTI_LOST, format!("{outcome}{rti}"))
             }
             Some(outcome @ Outcome::RtiFailed) => (exit::PEER_FAILED, outcome.to_string()),
-            Some(outcome @ Outcome::Rejected(_)) => (exit::NOT_JOINED, outcome.to_string()),
+            Some(outcome @ (Outcome::Rejected(_) | Outcome::NotJoined { .. })) => {
+                (exit::NOT_JOINED, outcome.to_string())
+            }
             Some(outcome) => (exit::FAILED, outcome.to_string()),
         }
     }
 
     fn rti_name(&self) -> String {
-        let address = self.io.connection.as_ref().and_then(Connection::peer);
+        let address = self.io.connection.as_ref().map(Connection::peer);
         address.map_or_else(String::new, |address| format!(" ({address})"))
     }
 }

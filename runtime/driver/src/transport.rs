@@ -3,6 +3,7 @@
 use ictus_core::Duration;
 use rustix::event::{EventfdFlags, PollFd, PollFlags, Timespec, eventfd, poll};
 use rustix::io::Errno;
+use rustix::net::sockopt;
 use std::io::{self, ErrorKind, Read, Write};
 use std::net::{Shutdown, SocketAddr, TcpStream};
 use std::os::fd::{AsFd, OwnedFd};
@@ -11,6 +12,12 @@ use std::sync::Arc;
 
 /// One read takes at most this much, so that a federate that lags sees a batch and not one message.
 const READ_BYTES: usize = 256 << 10;
+/// Silence after which the peer's host is probed, how often, and how often in vain.
+const KEEPALIVE_AFTER: std::time::Duration = std::time::Duration::from_secs(10);
+const KEEPALIVE_EVERY: std::time::Duration = std::time::Duration::from_secs(5);
+const KEEPALIVE_PROBES: u32 = 4;
+/// Probes are not sent while data is under way; this bounds it. The kernel counts a peer that does not read, too, so it is long.
+const UNACKNOWLEDGED_MAX_MS: u32 = 120_000;
 
 /// A non-blocking connection with a buffer of bytes that are not yet whole messages.
 #[derive(Debug)]
@@ -20,6 +27,7 @@ pub(crate) struct Connection {
     filled: usize,
     taken: usize,
     closed: bool,
+    peer: SocketAddr,
 }
 
 impl Connection {
@@ -28,7 +36,9 @@ impl Connection {
         let stream = TcpStream::connect_timeout(&address, timeout.to_std())?;
         stream.set_nodelay(true)?;
         stream.set_nonblocking(true)?;
+        notice_a_dead_host(&stream)?;
         Ok(Self {
+            peer: address,
             stream,
             buffer: vec![0; READ_BYTES],
             filled: 0,
@@ -87,9 +97,9 @@ impl Connection {
         out.drain(..written);
     }
 
-    /// The peer's address, while connected.
-    pub(crate) fn peer(&self) -> Option<SocketAddr> {
-        self.stream.peer_addr().ok()
+    /// The peer's address.
+    pub(crate) fn peer(&self) -> SocketAddr {
+        self.peer
     }
 
     /// Says that nothing more will be written.
@@ -97,6 +107,18 @@ impl Connection {
         // A peer that is gone already is as finished as can be.
         drop(self.stream.shutdown(Shutdown::Write));
     }
+}
+
+/// A host that vanishes sends nothing: silence is probed, and data that stays unacknowledged ends the connection.
+fn notice_a_dead_host(stream: &TcpStream) -> io::Result<()> {
+    sockopt::set_socket_keepalive(stream, true)?;
+    sockopt::set_tcp_keepidle(stream, KEEPALIVE_AFTER)?;
+    sockopt::set_tcp_keepintvl(stream, KEEPALIVE_EVERY)?;
+    sockopt::set_tcp_keepcnt(stream, KEEPALIVE_PROBES)?;
+    Ok(sockopt::set_tcp_user_timeout(
+        stream,
+        UNACKNOWLEDGED_MAX_MS,
+    )?)
 }
 
 /// Wakes a waiting federate from another thread.
@@ -178,12 +200,13 @@ pub(crate) fn wait(
     let [waker_fd, signals_fd] = base;
     let result;
     let mut woken = Woken::default();
-    match connection.filter(|c| !c.closed) {
+    // A peer that has only said its last word may still read.
+    match connection.filter(|c| !c.closed || wants_write) {
         Some(connection) => {
-            let wanted = if wants_write {
-                PollFlags::IN | PollFlags::OUT
-            } else {
-                PollFlags::IN
+            let wanted = match (connection.closed, wants_write) {
+                (false, false) => PollFlags::IN,
+                (false, true) => PollFlags::IN | PollFlags::OUT,
+                (true, _) => PollFlags::OUT,
             };
             let stream = PollFd::from_borrowed_fd(connection.stream.as_fd(), wanted);
             let mut fds = [waker_fd, signals_fd, stream];
@@ -211,4 +234,35 @@ pub(crate) fn wait(
 pub(crate) fn precise_waits() {
     // Without it waits are only less precise.
     let _ = rustix::thread::set_current_timer_slack(std::num::NonZeroU64::new(1));
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::net::TcpListener;
+
+    #[test]
+    fn a_peer_that_only_half_closed_gets_everything() {
+        let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+        let address = listener.local_addr().unwrap();
+        let mut connection = Connection::open(address, Duration::from_secs(5)).unwrap();
+        let (mut peer, _) = listener.accept().unwrap();
+        peer.shutdown(Shutdown::Write).unwrap();
+        let (waker, signals) = (Waker::new().unwrap(), Signals::new().unwrap());
+        while !connection.closed() {
+            wait(Some(&connection), false, &waker, &signals, None).unwrap();
+            connection.read();
+        }
+        let sent = 32 << 20;
+        let mut out = vec![7; sent];
+        connection.write(&mut out);
+        assert!(!out.is_empty(), "more than the socket takes");
+        let reader = std::thread::spawn(move || io::copy(&mut peer, &mut io::sink()).unwrap());
+        while !out.is_empty() {
+            wait(Some(&connection), true, &waker, &signals, None).unwrap();
+            connection.write(&mut out);
+        }
+        connection.finish();
+        assert_eq!(reader.join().unwrap(), sent as u64);
+    }
 }

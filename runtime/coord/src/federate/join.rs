@@ -1,13 +1,16 @@
 //! Joining, and what each message of the RTI means in each phase.
 
 use super::link::Link;
-use super::{Federate, FederateEvent, Incoming, Outcome, ProtocolError};
+use super::{Federate, FederateEvent, Incoming, Outcome, Poll, ProtocolError};
 use crate::payload::FederateExecutor;
 use crate::wire::{NO_CLOCK_SYNC, TaggedMessage, ToFederate, ToRti, capability};
 use ictus_core::{Duration, PhysicalTime, Tag};
 
 /// Round trips that scatter more than this say nothing: no correction is made. Source: section 4 of the wire document.
 const GUARD_BAND: Duration = Duration::from_micros(100);
+
+/// A step of joining that takes longer is not answered at all: joins are answered one by one, clocks compared at once.
+pub(super) const ANSWER_MAX: Duration = Duration::from_secs(60);
 
 /// Where a federate is in its life.
 #[derive(Debug)]
@@ -91,6 +94,26 @@ impl Federate {
         }
     }
 
+    /// Waits for the next step of joining, but not for ever.
+    pub(super) fn await_answer(&mut self, now: PhysicalTime) -> Poll {
+        let by = *self.answer_by.get_or_insert(now.saturating_add(ANSWER_MAX));
+        if now < by {
+            return Poll::Wait(Some(by));
+        }
+        let hint = match self.phase {
+            Phase::AwaitingAck => ": is an RTI listening there?",
+            Phase::Synchronizing(_) => ": an RTI with `-c off` compares no clocks",
+            Phase::Idle
+            | Phase::AwaitingStart
+            | Phase::Running
+            | Phase::Draining
+            | Phase::Ended => "",
+        };
+        let phase = self.phase.name();
+        self.end_with(Outcome::NotJoined { phase, hint });
+        Poll::Ended
+    }
+
     /// Takes what the RTI sent and returns how many bytes were whole messages; the driver keeps the rest.
     pub fn receive(
         &mut self,
@@ -121,6 +144,7 @@ impl Federate {
         message: &ToFederate<'_>,
         executor: &mut impl FederateExecutor,
     ) -> Result<(), Outcome> {
+        self.answer_by = None;
         match (&mut self.phase, message) {
             (Phase::Draining | Phase::Ended, _) => Ok(()),
             (_, ToFederate::Reject(reason)) => Err(Outcome::Rejected(*reason)),
