@@ -141,6 +141,9 @@ pub enum Disconnect {
     /// The peer reset the connection.
     #[error("the connection was reset")]
     Reset,
+    /// The driver closed it to make room: [`Rti::least_needed`].
+    #[error("its place was given to another")]
+    Evicted,
     /// The socket failed.
     #[error("the connection failed: {0}")]
     Error(String),

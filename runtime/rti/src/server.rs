@@ -19,6 +19,10 @@ const LISTENER: Token = Token(usize::MAX);
 const SIGNALS: Token = Token(usize::MAX - 1);
 /// Connections that have not said who they are, beyond those of the federates.
 const STRANGERS: usize = 256;
+/// The most connections accepted in one round: all are read, four times at least, before the oldest must make room.
+const ACCEPT: usize = STRANGERS / 4;
+/// How many newcomers the system keeps for us, as far as it allows: a whole large federation comes at once.
+const BACKLOG: i32 = 4096;
 /// When accepting fails (no descriptor is left), or a reader of what the RTI says of itself is behind, it is tried again
 /// after this long.
 const TRY_AGAIN: Duration = Duration::from_millis(100);
@@ -28,8 +32,7 @@ const TRY_AGAIN: Duration = Duration::from_millis(100);
 pub struct Server {
     poll: Poll,
     listener: Option<TcpListener>,
-    /// Whether connections may be waiting.
-    accepting: bool,
+    accepting: Accepting,
     signals: Option<UnixStream>,
     stop_requested: bool,
     sockets: Vec<Option<Socket>>,
@@ -38,6 +41,17 @@ pub struct Server {
     status: Status,
     buffer: Vec<u8>,
     port: u16,
+}
+
+/// Whether connections may be waiting.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Accepting {
+    /// None; an event will tell.
+    Idle,
+    /// Some may be.
+    Ready,
+    /// There is no room for one, or accepting has failed.
+    Stuck,
 }
 
 /// Why a server cannot run. Fatal.
@@ -82,6 +96,7 @@ impl Server {
                 BindError::Listen { address, source }
             }
         })?;
+        rustix::net::listen(&listener, BACKLOG).map_err(io::Error::from)?;
         let poll = Poll::new()?;
         poll.registry()
             .register(&mut listener, LISTENER, Interest::READABLE)?;
@@ -93,7 +108,7 @@ impl Server {
         Ok(Self {
             poll,
             listener: Some(listener),
-            accepting: true,
+            accepting: Accepting::Ready,
             signals: None,
             stop_requested: false,
             sockets: Vec::new(),
@@ -145,7 +160,7 @@ impl Server {
             }
             let now = physical_time();
             let woken = self.note(&events, now);
-            if self.accepting {
+            if self.accepting != Accepting::Idle {
                 self.accept(now);
             }
             self.read_round(now);
@@ -168,11 +183,12 @@ impl Server {
 
     /// How long nothing needs to be done; `None`: until an event.
     fn patience(&self) -> Option<Duration> {
-        if self.sockets.iter().flatten().any(|socket| socket.readable) {
+        let readable = self.sockets.iter().flatten().any(|socket| socket.readable);
+        if readable || self.accepting == Accepting::Ready {
             return Some(Duration::ZERO);
         }
-        let accepting = self.accepting && self.listener.is_some();
-        let again = (accepting || self.status.is_behind()).then_some(TRY_AGAIN);
+        let stuck = self.accepting == Accepting::Stuck;
+        let again = (stuck || self.status.is_behind()).then_some(TRY_AGAIN);
         let deadline = self
             .rti
             .poll_timeout()
@@ -188,7 +204,7 @@ impl Server {
         let mut writable = Vec::new();
         for event in events {
             match event.token() {
-                LISTENER => self.accepting = true,
+                LISTENER => self.accepting = Accepting::Ready,
                 SIGNALS => self.take_signals(now),
                 Token(index) => {
                     let Some(Some(socket)) = self.sockets.get_mut(index) else {
@@ -223,27 +239,39 @@ impl Server {
         }
     }
 
+    /// Accepts what is waiting. Where there is no room a stranger makes some, else newcomers stay in the backlog.
     fn accept(&mut self, now: PhysicalTime) {
-        while let Some(listener) = &self.listener {
-            let (stream, peer) = match listener.accept() {
-                Ok(accepted) => accepted,
-                Err(error) if passes(&error) => continue,
+        self.accepting = Accepting::Ready;
+        for _ in 0..ACCEPT {
+            let Some(listener) = &self.listener else {
+                self.accepting = Accepting::Idle;
+                return;
+            };
+            let full = self.sockets.iter().flatten().count() >= self.most_sockets;
+            let evicted = if full { self.rti.least_needed() } else { None };
+            if full && evicted.is_none() {
+                self.accepting = Accepting::Stuck;
+                return;
+            }
+            match listener.accept() {
+                Ok((stream, peer)) => {
+                    if let Some(id) = evicted {
+                        self.remove(id, now, &Disconnect::Evicted);
+                    }
+                    self.add(stream, peer, now);
+                }
+                Err(error) if passes(&error) => {}
                 Err(error) if error.kind() == io::ErrorKind::WouldBlock => {
-                    self.accepting = false;
+                    self.accepting = Accepting::Idle;
                     return;
                 }
                 Err(error) => {
                     self.status
                         .say(&format!("cannot accept a connection: {error}"));
+                    self.accepting = Accepting::Stuck;
                     return;
                 }
-            };
-            if self.sockets.iter().flatten().count() >= self.most_sockets {
-                self.status
-                    .say(&format!("refused {peer}: too many connections"));
-                continue;
             }
-            self.add(stream, peer, now);
         }
     }
 
@@ -315,6 +343,7 @@ impl Server {
         while let Some(event) = self.rti.poll_event() {
             if matches!(event, RtiEvent::Ended { .. }) {
                 self.listener = None;
+                self.accepting = Accepting::Idle;
             }
             self.status.tell(event);
         }

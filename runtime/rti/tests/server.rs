@@ -195,6 +195,22 @@ fn bad_bytes_hurt_nobody_else() {
 }
 
 #[test]
+fn silent_strangers_keep_nobody_out() {
+    let rti = serve(Options::new("test", 2));
+    let mut first = rti.join(0, &[], &[]);
+    assert_eq!(first.next().unwrap(), "Ack");
+    // More than there is room for.
+    let mut silent: Vec<_> = (0..270).map(|_| rti.connect()).collect();
+    let mut second = rti.join(1, &[], &[]);
+    second.start();
+    first.wait_for("Timestamp(");
+    assert_eq!(silent[0].next(), None, "the oldest made room");
+    first.resign();
+    second.resign();
+    assert_eq!(rti.ended(), 0);
+}
+
+#[test]
 fn a_late_connection_is_refused_at_once() {
     let rti = serve(Options::new("test", 1));
     let mut only = rti.join(0, &[], &[]);

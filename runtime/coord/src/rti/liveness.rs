@@ -64,6 +64,26 @@ impl Rti {
             .min()
     }
 
+    /// The connection to close when there is no room for another: the oldest that has not said who it is, else the oldest
+    /// that was refused and has not gone. O(connections).
+    #[must_use]
+    pub fn least_needed(&self) -> Option<ConnectionId> {
+        let rank = |link: Link| match link {
+            Link::Unknown { deadline } => Some((false, deadline)),
+            Link::Closing {
+                deadline,
+                stranger: true,
+            } => Some((true, deadline)),
+            Link::Closing { .. } | Link::Member(_) | Link::Free => None,
+        };
+        self.connections
+            .iter()
+            .enumerate()
+            .filter_map(|(index, connection)| Some((rank(connection.link)?, ConnectionId(index))))
+            .min()
+            .map(|(_, id)| id)
+    }
+
     fn check_connection(&mut self, id: ConnectionId) {
         let connection = &self.connections[id.0];
         match connection.link {
