@@ -400,6 +400,8 @@ impl Agent {
         let member = self.member_mut(id);
         member.process = Process::Ended;
         member.pid = record.pid;
+        // One that lost the RTI to SIGKILL before its own arrived says so with its exit code.
+        member.killed = member.signalled == Some(StopSignal::Kill) && !record.ending.success();
         let how = record.ending.describe();
         member.view.ending = Some(how.clone());
         let ran = if member.ours {
@@ -490,7 +492,7 @@ impl Agent {
             )
         };
         if self.outcome().is_none() && gone(&self.rti) && self.federates.iter().all(gone) {
-            let outcome = self.conclude();
+            let outcome = self.conclude(now);
             self.tell(Event::Ended {
                 outcome: outcome.clone(),
             });

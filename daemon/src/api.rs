@@ -125,7 +125,8 @@ pub enum Outcome {
     Completed,
     /// It was stopped by request.
     Stopped {
-        /// Federates that did not reach the stop tag in time and were signalled.
+        /// Federates that did not reach the stop tag in time and ended on SIGTERM. When one had to be killed
+        /// it is [`Outcome::Failed`].
         missed: Vec<String>,
     },
     /// It failed; what was running was stopped.

@@ -56,7 +56,7 @@ impl Agent {
         (!ladder).then_some(rank)
     }
 
-    pub(super) fn conclude(&mut self) -> Outcome {
+    pub(super) fn conclude(&mut self, now: Now) -> Outcome {
         let first = self
             .failures
             .drain(..)
@@ -72,18 +72,52 @@ impl Agent {
                 failure,
                 was_healthy: self.was_healthy,
             },
-            (
-                None,
-                Phase::Stopping {
-                    why: Why::Requested,
-                    missed,
-                    ..
-                },
-            ) => Outcome::Stopped {
-                missed: std::mem::take(missed),
-            },
-            (None, _) => Outcome::Completed,
+            (None, phase) => {
+                let (requested, terminated) = match phase {
+                    Phase::Stopping { why, missed, .. } => {
+                        (*why == Why::Requested, std::mem::take(missed))
+                    }
+                    Phase::Starting { .. } | Phase::Running | Phase::Ended(_) => {
+                        (false, Vec::new())
+                    }
+                };
+                match self.missed_by_force(&terminated) {
+                    Some(what) => Outcome::Failed {
+                        failure: Failure {
+                            kind: FailureKind::Timeout,
+                            member: None,
+                            what,
+                            lines: Vec::new(),
+                            log: None,
+                            at_ns: now.wall_ns,
+                        },
+                        was_healthy: self.was_healthy,
+                    },
+                    None if requested => Outcome::Stopped { missed: terminated },
+                    None => Outcome::Completed,
+                }
+            }
         }
+    }
+
+    /// Who did not reach the stop tag, in words; absent when nobody had to be killed.
+    fn missed_by_force(&self, terminated: &[String]) -> Option<String> {
+        if !self.rti.killed && !self.federates.iter().any(|member| member.killed) {
+            return None;
+        }
+        let missed = |member: &&Member| member.killed || terminated.contains(&member.name);
+        let names: Vec<_> = self.federates.iter().filter(missed).collect();
+        // Without federates it is the RTI that hung.
+        let names = if names.is_empty() {
+            vec![&self.rti]
+        } else {
+            names
+        };
+        let names: Vec<_> = names.iter().map(|member| member.name.as_str()).collect();
+        Some(format!(
+            "did not reach the stop tag in time: {}",
+            names.join(", ")
+        ))
     }
 
     /// Why the start takes too long.

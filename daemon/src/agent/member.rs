@@ -16,6 +16,8 @@ pub(super) struct Member {
     pub(super) view: MemberView,
     pub(super) reason: Option<String>,
     pub(super) signalled: Option<StopSignal>,
+    /// SIGKILL was sent before it ended in order.
+    pub(super) killed: bool,
 }
 
 /// Where a member's process stands.
@@ -49,6 +51,7 @@ impl Member {
             },
             reason: None,
             signalled: None,
+            killed: false,
         }
     }
 

@@ -132,6 +132,7 @@ impl Agent {
                     .view
                     .ending
                     .get_or_insert_with(|| "did not end after SIGKILL".to_owned());
+                member.killed |= member.process != Process::Gone;
                 member.process = Process::Gone;
             }
         }

@@ -147,6 +147,21 @@ impl World {
         self.actions().into_iter().filter_map(signal).collect()
     }
 
+    /// What the outcome says of a stop that had to kill.
+    #[track_caller]
+    fn missed(&self) -> String {
+        let Some(Outcome::Failed {
+            failure,
+            was_healthy: true,
+        }) = self.agent.outcome()
+        else {
+            panic!("{:?}", self.agent.outcome());
+        };
+        let expected = (FailureKind::Timeout, None);
+        assert_eq!((failure.kind, failure.member.clone()), expected);
+        failure.what.clone()
+    }
+
     fn time_out(&mut self) {
         self.now.since = self.agent.poll_timeout().unwrap();
         self.agent.handle_timeout(self.now);
@@ -288,8 +303,41 @@ fn a_stop_climbs_the_ladder_and_names_who_missed_the_stop_tag() {
     );
     world.ends(B, KILLED);
     world.ends(MemberId::Rti, KILLED);
-    let missed = vec!["b".to_owned()];
+    assert_eq!(world.missed(), "did not reach the stop tag in time: b");
+}
+
+#[test]
+fn a_stop_that_is_forced_at_once_names_who_was_killed() {
+    let mut world = World::healthy();
+    world.agent.handle_stop(world.now);
+    world.ends(A, OK);
+    world.agent.handle_kill(world.now);
+    // It may see the end of the RTI before its own SIGKILL.
+    world.ends(B, Ending::Exited { code: 10 });
+    world.ends(MemberId::Rti, KILLED);
+    assert_eq!(world.missed(), "did not reach the stop tag in time: b");
+}
+
+#[test]
+fn who_ends_by_itself_despite_a_forced_stop_has_not_missed_the_stop_tag() {
+    let mut world = World::healthy();
+    world.agent.handle_stop(world.now);
+    world.agent.handle_kill(world.now);
+    for id in [A, B, MemberId::Rti] {
+        world.ends(id, OK);
+    }
+    let missed = Vec::new();
     assert_eq!(world.agent.outcome(), Some(&Outcome::Stopped { missed }));
+}
+
+#[test]
+fn an_rti_that_hangs_after_its_federates_is_named() {
+    let mut world = World::healthy();
+    world.ends(A, OK);
+    world.ends(B, OK);
+    world.agent.handle_kill(world.now);
+    world.ends(MemberId::Rti, KILLED);
+    assert_eq!(world.missed(), "did not reach the stop tag in time: rti");
 }
 
 #[test]
@@ -298,7 +346,7 @@ fn even_a_process_that_survives_sigkill_does_not_hold_the_stop() {
     world.agent.handle_kill(world.now);
     assert_eq!(world.agent.outcome(), None);
     world.time_out();
-    assert!(world.agent.outcome().is_some());
+    assert_eq!(world.missed(), "did not reach the stop tag in time: a, b");
 }
 
 #[test]

@@ -241,16 +241,34 @@ async fn a_record_that_does_not_match_is_foreign_and_its_process_never_signalled
 #[tokio::test]
 async fn a_deaf_federate_is_killed_and_said_to_have_missed_the_stop_tag() {
     let world = World::new().await;
-    let _pair = world
-        .start_healthy("pair", &federation(&[("a", ""), ("b", "deaf")]))
-        .await;
-    let mut stop = world.client.stop("pair", false).await.unwrap();
-    assert_eq!(
-        outcome(&mut stop).await,
-        Outcome::Stopped {
-            missed: vec!["b".to_owned()]
+    let mut request = federation(&[("a", ""), ("b", "deaf")]);
+    for forced in [false, true] {
+        if forced {
+            request.settings.stop_grace = BOUND;
         }
-    );
+        let _pair = world.start_healthy("pair", &request).await;
+        let mut stop = world.client.stop("pair", false).await.unwrap();
+        if forced {
+            let ended_a =
+                |event: &Event| matches!(event, Event::Exited { member, .. } if member == "a");
+            while !ended_a(&next(&mut stop).await.event) {}
+            stop = world.client.stop("pair", true).await.unwrap();
+        }
+        let Outcome::Failed {
+            failure,
+            was_healthy: true,
+        } = outcome(&mut stop).await
+        else {
+            panic!()
+        };
+        assert_eq!(
+            (failure.kind, failure.what.as_str()),
+            (
+                FailureKind::Timeout,
+                "did not reach the stop tag in time: b"
+            )
+        );
+    }
 }
 
 #[tokio::test]
