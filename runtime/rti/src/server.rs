@@ -351,12 +351,22 @@ impl Server {
     }
 }
 
-/// Lets the system find out that a peer's host is gone: within half a minute of silence.
+/// How long a peer's host may acknowledge nothing, or its program take nothing of what waits for it.
+const SILENCE: Duration = Duration::from_secs(120);
+
+/// Lets the system find out that a peer's host is gone: within [`SILENCE`], whether or not anything is on its way to it.
+///
+/// While data is unacknowledged no probe is sent, and the system would send it again for a quarter of an hour: the user
+/// timeout ends that, and rules over the number of probes too. It also ends the connection of a live program that takes
+/// nothing at all for that long while more waits for it than the sockets hold (Linux counts a window that stays shut), so
+/// it is not shorter.
 fn keep_alive(stream: &mio::net::TcpStream) -> io::Result<()> {
     sockopt::set_socket_keepalive(stream, true)?;
     sockopt::set_tcp_keepidle(stream, Duration::from_secs(15))?;
     sockopt::set_tcp_keepintvl(stream, Duration::from_secs(5))?;
     sockopt::set_tcp_keepcnt(stream, 3)?;
+    let silence = u32::try_from(SILENCE.as_millis()).unwrap_or(u32::MAX);
+    sockopt::set_tcp_user_timeout(stream, silence)?;
     Ok(())
 }
 
@@ -374,4 +384,19 @@ fn physical_time() -> PhysicalTime {
         .duration_since(SystemTime::UNIX_EPOCH)
         .unwrap_or_default();
     PhysicalTime::from_nanos(i64::try_from(since_epoch.as_nanos()).unwrap_or(i64::MAX))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_dead_host_is_found_out_with_data_on_its_way() {
+        let listener = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+        let stream = std::net::TcpStream::connect(listener.local_addr().unwrap()).unwrap();
+        let stream = mio::net::TcpStream::from_std(stream);
+        keep_alive(&stream).unwrap();
+        assert!(sockopt::socket_keepalive(&stream).unwrap());
+        assert_eq!(sockopt::tcp_user_timeout(&stream).unwrap(), 120_000);
+    }
 }
