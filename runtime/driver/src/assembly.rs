@@ -11,6 +11,9 @@ use crate::scope::{DeclaredPort, Elaboration, WiringError};
 use crate::slot::Epoch;
 use ictus_coord::plan::{ConnectionPlan, Endpoint, FederatePlan, Plan};
 use ictus_core::{Delay, Duration, PortId, PortKind, Program, ProgramError, ReactorId, Tag};
+use std::any::Any;
+use std::collections::BTreeSet;
+use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::rc::Rc;
 use std::sync::Arc;
 use thiserror::Error;
@@ -37,6 +40,24 @@ pub enum AssemblyError {
     NoFederate {
         /// The id.
         id: u16,
+    },
+    /// A name that cannot stand in traces and file names, or that two federates have.
+    #[error("`{federate}` cannot be a federate's name: {why}")]
+    Name {
+        /// The name.
+        federate: String,
+        /// Why not.
+        why: &'static str,
+    },
+    /// The class's own code panicked while an instance was built: an initial value, a width, a `#[connections]` function.
+    #[error("federate {federate} (class {class}): building it panicked: {message}")]
+    Panicked {
+        /// The federate.
+        federate: String,
+        /// Its class.
+        class: String,
+        /// The panic's words.
+        message: String,
     },
     /// The federate is a foreign one: it has no class to instantiate.
     #[error("federate {federate} is foreign: it has no class")]
@@ -119,6 +140,7 @@ impl Assembly {
         classes: &[Class],
         clock: Arc<dyn Clock>,
     ) -> Result<Self, AssemblyError> {
+        check_names(plan)?;
         let mut assembler = Assembler::new(plan, clock);
         for id in mine {
             assembler.instantiate(*id, classes)?;
@@ -128,6 +150,32 @@ impl Assembly {
         }
         assembler.finish()
     }
+}
+
+fn check_names(plan: &Plan) -> Result<(), AssemblyError> {
+    let mut seen = BTreeSet::new();
+    for FederatePlan { name, .. } in &plan.federates {
+        let letters = |b: u8| b.is_ascii_alphanumeric() || b == b'_' || b == b'-';
+        let why = if !name.starts_with(|c: char| c.is_ascii_alphabetic()) {
+            "it does not begin with a letter"
+        } else if !name.bytes().all(letters) {
+            "only letters, digits, `_` and `-` are allowed"
+        } else if !seen.insert(name.as_str()) {
+            "another federate has it"
+        } else {
+            continue;
+        };
+        let federate = name.clone();
+        return Err(AssemblyError::Name { federate, why });
+    }
+    Ok(())
+}
+
+/// What a panic said.
+pub(crate) fn words(panic: &(dyn Any + Send)) -> String {
+    let text = panic.downcast_ref::<&str>().map(|text| (*text).to_owned());
+    let text = text.or_else(|| panic.downcast_ref::<String>().cloned());
+    text.unwrap_or_else(|| "a panic without words".to_owned())
 }
 
 /// An assembly in the making.
@@ -179,7 +227,14 @@ impl<'a> Assembler<'a> {
             known: classes.iter().map(|c| c.name().to_owned()).collect(),
         })?;
         let parameters = federate.parameters.clone();
-        let reactor = class.build(&mut self.elaboration, &federate.name, parameters);
+        let elaboration = &mut self.elaboration;
+        // What is half built is thrown away with the assembler.
+        let build = AssertUnwindSafe(|| class.build(elaboration, &federate.name, parameters));
+        let reactor = catch_unwind(build).map_err(|panic| AssemblyError::Panicked {
+            federate: federate.name.clone(),
+            class: name.clone(),
+            message: words(&*panic),
+        })?;
         let reactor = reactor.map_err(|source| AssemblyError::Parameter {
             federate: federate.name.clone(),
             class: name.clone(),

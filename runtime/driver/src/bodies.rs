@@ -1,6 +1,7 @@
 //! Values and reaction bodies: what the timeline decides about, executed.
 
 use crate::access::Outcome;
+use crate::assembly::words;
 use crate::carrier::{Carrier, Sender};
 use crate::ctx::Ctx;
 pub(crate) use crate::observe::Observation;
@@ -148,7 +149,8 @@ impl Bodies {
         let entry = &mut self.bodies[node.index()];
         self.ctx.reactor = entry.reactor;
         let late = match entry.deadline {
-            Some(deadline) => self.ctx.lag() > deadline,
+            // As in LF, a deadline of zero is always missed.
+            Some(deadline) => deadline == Duration::ZERO || self.ctx.lag() > deadline,
             None => false,
         };
         self.counters.reactions += 1;
@@ -215,13 +217,11 @@ impl Bodies {
     #[cold]
     fn fail(&mut self, node: NodeId, panic: &(dyn Any + Send)) {
         let spec = &self.program.reactions()[node.index()].spec;
-        let text = panic.downcast_ref::<&str>().map(|text| (*text).to_owned());
-        let text = text.or_else(|| panic.downcast_ref::<String>().cloned());
         self.fault = Some(Fault {
             path: self.program.reactor_path(spec.reactor).to_owned(),
             reaction: spec.name.clone(),
             tag: self.ctx.tag,
-            message: text.unwrap_or_else(|| "a panic without words".to_owned()),
+            message: words(panic),
         });
     }
 }

@@ -293,6 +293,10 @@ impl Runner<'_> {
             }
             if steps % STEPS_PER_LOOK == 0 {
                 self.look(now);
+                // A program that never waits still hears signals.
+                if self.io.signals.pending() {
+                    self.take_signals()?;
+                }
             }
             match self.federate.poll(now, &mut self.bodies) {
                 Poll::Run => self.execute(now)?,

@@ -49,6 +49,16 @@ pub(crate) struct DeclaredPort {
 #[derive(Clone, PartialEq, Eq, Debug, Error)]
 #[non_exhaustive]
 pub enum WiringError {
+    /// A span of time that cannot be negative is.
+    #[error("{path}: the {what} is negative: {span}")]
+    Negative {
+        /// The reactor.
+        path: String,
+        /// What the span is.
+        what: &'static str,
+        /// The span.
+        span: Duration,
+    },
     /// A multiport is connected to one of another width.
     #[error("{path}: a connection joins {from} channels to {to}")]
     Widths {
@@ -180,8 +190,18 @@ impl Scope<'_> {
         Multi::new(ports.into_iter().map(Output::new).collect())
     }
 
+    fn not_negative(&mut self, what: &'static str, span: Duration) {
+        if span < Duration::ZERO {
+            let path = self.path.clone();
+            let error = WiringError::Negative { path, what, span };
+            self.elaboration.errors.push(error);
+        }
+    }
+
     /// Adds a timer that fires at start + `offset`, then every `period`; a period of zero means once.
     pub fn timer(&mut self, offset: Duration, period: Duration) -> Timer {
+        self.not_negative("offset of a timer", offset);
+        self.not_negative("period of a timer", period);
         let signal = Signal::default();
         let kind = ActionKind::Timer { offset, period };
         let action = self.elaboration.action(kind, Box::new(signal.clone()));
@@ -194,6 +214,7 @@ impl Scope<'_> {
         name: &'static str,
         min_delay: Duration,
     ) -> LogicalAction<T> {
+        self.not_negative("minimum delay of an action", min_delay);
         let values = Shared::new(ActionValues::new());
         let kind = ActionKind::Logical { min_delay };
         let action = self.elaboration.action(kind, Box::new(values.clone()));
@@ -207,6 +228,8 @@ impl Scope<'_> {
         min_delay: Duration,
         min_spacing: Duration,
     ) -> PhysicalAction<T> {
+        self.not_negative("minimum delay of an action", min_delay);
+        self.not_negative("minimum spacing of an action", min_spacing);
         let values = Shared::new(ActionValues::new());
         let kind = ActionKind::Physical {
             min_delay,
@@ -290,6 +313,9 @@ impl<R: 'static> ReactionScope<'_, R> {
         args: A,
         body: impl FnMut(&mut R, &mut Ctx, &mut A, bool) + 'static,
     ) {
+        if let Some(deadline) = deadline {
+            self.scope.not_negative("deadline of a reaction", deadline);
+        }
         let mut declaration = Declaration::default();
         args.declare(&mut declaration);
         let elaboration = &mut *self.scope.elaboration;

@@ -2,7 +2,8 @@
 //!
 //! [`Federation::simulate`] runs every federate and the RTI in a simulated world. The seed draws how long messages take, when the
 //! network is cut, how clocks are off and how long reactions take; laws of coordination are checked on the way. Whatever the seed,
-//! the trace must be the one of the program [`alone`](Federation::alone).
+//! the trace must be the one of the program [`alone`](Federation::alone), unless a reaction reads the physical clock or misses a
+//! deadline: then the seed decides.
 //!
 //! ```
 //! use ictus::prelude::*;
@@ -95,6 +96,15 @@ pub enum FederationError {
         /// The federate.
         federate: String,
     },
+    /// There is no federate.
+    #[error("the federation has no federate")]
+    Empty,
+    /// There is no time-out: a run must end by itself, and everywhere at the same tag.
+    #[error("the federation has no time-out: add `.timeout(10.secs())`")]
+    Endless,
+    /// A delay or the time-out is negative.
+    #[error("a delay or the time-out is negative")]
+    Negative,
     /// An end of a connection is not `FEDERATE.PORT` or `FEDERATE.PORT[CHANNEL]`, or there is no such federate.
     #[error("`{end}` is no port: write FEDERATE.PORT or FEDERATE.PORT[CHANNEL]; federates are {}", .known.join(", "))]
     End {
@@ -157,7 +167,7 @@ impl Default for Federation {
 }
 
 impl Federation {
-    /// A federation of nobody, which ends when nothing is left to do.
+    /// A federation of nobody, without the time-out that it needs.
     #[must_use]
     pub fn new() -> Self {
         Self {
@@ -312,6 +322,9 @@ impl Federation {
     ///
     /// As [`Federation::alone`]; when there is a physical action; when a law of coordination is broken.
     pub fn simulate(&self, seed: u64) -> Result<Trace, SimulateError> {
+        // What does not fit together is found in one program, with the better words.
+        let all: Vec<u16> = (0..self.count()).collect();
+        self.assemble(&all)?;
         let mut parts = Vec::new();
         let mut memories = Vec::new();
         for id in 0..self.count() {
@@ -356,6 +369,14 @@ impl Federation {
     ) -> Result<(Assembly, Arc<SimulatedClock>, Memory), SimulateError> {
         if let Some(error) = &self.error {
             return Err(error.clone().into());
+        }
+        if self.plan.federates.is_empty() {
+            return Err(FederationError::Empty.into());
+        }
+        let timeout = self.plan.timeout_ns.ok_or(FederationError::Endless)?;
+        let spans = self.plan.connections.iter().filter_map(|c| c.after_ns);
+        if spans.chain([timeout]).any(|span| span < 0) {
+            return Err(FederationError::Negative.into());
         }
         let clock = Arc::new(SimulatedClock::default());
         let mut assembly = Assembly::new(&self.plan, ids, &self.class_list(), clock.clone())?;

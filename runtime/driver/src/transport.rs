@@ -9,6 +9,7 @@ use std::net::{Shutdown, SocketAddr, TcpStream};
 use std::os::fd::{AsFd, OwnedFd};
 use std::os::unix::net::UnixStream;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 
 /// One read takes at most this much, so that a federate that lags sees a batch and not one message.
 const READ_BYTES: usize = 256 << 10;
@@ -147,6 +148,7 @@ impl Waker {
 #[derive(Debug)]
 pub(crate) struct Signals {
     stream: UnixStream,
+    pending: Arc<AtomicBool>,
 }
 
 impl Signals {
@@ -154,14 +156,22 @@ impl Signals {
         let (stream, writer) = UnixStream::pair()?;
         stream.set_nonblocking(true)?;
         writer.set_nonblocking(true)?;
+        let pending = Arc::new(AtomicBool::new(false));
         for signal in [signal_hook::consts::SIGTERM, signal_hook::consts::SIGINT] {
             signal_hook::low_level::pipe::register(signal, writer.try_clone()?)?;
+            signal_hook::flag::register(signal, Arc::clone(&pending))?;
         }
-        Ok(Self { stream })
+        Ok(Self { stream, pending })
+    }
+
+    /// Whether a signal has come since the last call of [`Signals::take`]; costs next to nothing.
+    pub(crate) fn pending(&self) -> bool {
+        self.pending.load(Ordering::Relaxed)
     }
 
     /// How many signals have come since the last call.
     pub(crate) fn take(&mut self) -> usize {
+        self.pending.store(false, Ordering::Relaxed);
         let mut bytes = [0; 16];
         self.stream.read(&mut bytes).unwrap_or(0)
     }

@@ -49,6 +49,33 @@ fn a_late_reaction_is_replaced_by_its_handler() {
     assert_eq!(ran.deadlines_missed, 1);
 }
 
+#[test]
+fn a_deadline_of_zero_is_always_missed() {
+    let world = World::new(&[Class::of::<Strict>()])
+        .federate("strict", "Strict", "{}")
+        .timeout(10.ms());
+    // Every tag starts early, as in a fast run.
+    let ran = world.run();
+    assert_eq!((ran.fault, ran.deadlines_missed), (None, 2));
+}
+
+/// Its reaction is never in time.
+#[reactor]
+struct Strict {
+    #[timer(period = 10.ms())]
+    tick: Timer,
+}
+
+#[reactions]
+impl Strict {
+    #[reaction(deadline = 0.ms(), late = Self::late)]
+    fn tick(&mut self, _tick: &Timer) {
+        unreachable!("the handler runs instead");
+    }
+
+    fn late(&mut self, _tick: &Timer) {}
+}
+
 /// Its first reaction takes so long that the second, at the same tag, is late.
 #[reactor]
 struct Slow {

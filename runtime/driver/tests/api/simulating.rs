@@ -126,6 +126,16 @@ fn mistakes_are_named() {
         matches!(&error, SimulateError::Federation(FederationError::End { end, .. }) if end == "nobody.input"),
         "{error}"
     );
+    let error = asking(0).simulate(0).unwrap_err();
+    assert!(error.to_string().contains("no time-out"), "{error}");
+    let federation = asking(0).timeout(1.secs());
+    let loops = federation.connect("doubler.out", "doubler.input", None);
+    let words = |result: Result<_, SimulateError>| result.unwrap_err().to_string();
+    let (alone, simulated) = (
+        words(loops.alone().map(|_| ())),
+        words(loops.simulate(1).map(|_| ())),
+    );
+    assert_eq!(alone, simulated);
     let federation = Federation::new().federate::<Judge>("judge", json!(3));
     assert!(
         federation
@@ -134,7 +144,9 @@ fn mistakes_are_named() {
             .to_string()
             .contains("judge: parameters")
     );
-    let federation = asking(0).connect("asker.asked", "judge.input", None);
+    let federation = asking(0)
+        .timeout(1.secs())
+        .connect("asker.asked", "judge.input", None);
     assert!(
         federation
             .alone()
