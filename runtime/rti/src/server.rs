@@ -79,7 +79,7 @@ pub enum BindError {
 }
 
 impl Server {
-    /// Opens the listener and says so.
+    /// Opens the listener; [`Server::run`] says so, when all else is in place.
     ///
     /// # Errors
     ///
@@ -104,7 +104,6 @@ impl Server {
         for warning in &options.warnings {
             status.say(warning);
         }
-        status.listening(port);
         Ok(Self {
             poll,
             listener: Some(listener),
@@ -151,6 +150,7 @@ impl Server {
     ///
     /// When the system refuses to wait for events.
     pub fn run(mut self) -> Result<u8, BindError> {
+        self.status.listening(self.port);
         let mut events = Events::with_capacity(1024);
         loop {
             match self.poll.poll(&mut events, self.patience()) {
