@@ -61,10 +61,9 @@ impl Rti {
 
     fn identify(&mut self, id: ConnectionId, federate: u16, federation: &[u8]) {
         let refusal = if federation != self.config.federation.as_bytes() {
-            let named = String::from_utf8_lossy(federation);
             Some((
                 RejectReason::FederationId,
-                format!("it names federation `{named}`"),
+                format!("it names federation `{}`", printable(federation)),
             ))
         } else if federate >= self.config.federates {
             let words = format!("federate {federate} of {}", self.config.federates);
@@ -301,6 +300,21 @@ impl Rti {
             }
         }
     }
+}
+
+/// A peer's text for people: no control characters, and not longer than a line has room for.
+fn printable(text: &[u8]) -> String {
+    const MOST: usize = 64;
+    let text = String::from_utf8_lossy(text);
+    let mut shown: String = text
+        .chars()
+        .take(MOST)
+        .flat_map(char::escape_debug)
+        .collect();
+    if text.chars().nth(MOST).is_some() {
+        shown.push('…');
+    }
+    shown
 }
 
 /// The next multiple of `multiple` at or after `time`.
