@@ -4,7 +4,7 @@
 //! A start is all or nothing: whatever fails before every federate has completed its first tag ends the
 //! others. Every wait has a bound; the ladder is stop consensus, SIGTERM, SIGKILL, giving up.
 
-use std::collections::VecDeque;
+use std::collections::{BTreeSet, VecDeque};
 use std::time::Duration;
 
 use ictus_deploy::{FederateKind, Settings};
@@ -114,6 +114,8 @@ pub struct Agent {
     lost_one: bool,
     /// Connections that the RTI refused.
     rejected: u32,
+    /// Who was sent SIGKILL before it ended in order.
+    killed: BTreeSet<MemberId>,
     failures: Vec<Ranked>,
     actions: VecDeque<Action>,
 }
@@ -207,6 +209,7 @@ impl Agent {
             was_healthy: false,
             lost_one: false,
             rejected: 0,
+            killed: BTreeSet::new(),
             failures: Vec::new(),
             actions: VecDeque::new(),
         }
@@ -397,11 +400,13 @@ impl Agent {
         let starting = matches!(self.phase, Phase::Starting { .. });
         let start_agreed = self.start_ns.is_some();
         let (others_live, lost_one) = (self.others_live(id), self.lost_one);
+        // One that lost the RTI to SIGKILL before its own arrived says so with its exit code.
+        if self.member(id).signalled == Some(StopSignal::Kill) && !record.ending.success() {
+            self.killed.insert(id);
+        }
         let member = self.member_mut(id);
         member.process = Process::Ended;
         member.pid = record.pid;
-        // One that lost the RTI to SIGKILL before its own arrived says so with its exit code.
-        member.killed = member.signalled == Some(StopSignal::Kill) && !record.ending.success();
         let how = record.ending.describe();
         member.view.ending = Some(how.clone());
         let ran = if member.ours {

@@ -102,18 +102,22 @@ impl Agent {
 
     /// Who did not reach the stop tag, in words; absent when nobody had to be killed.
     fn missed_by_force(&self, terminated: &[String]) -> Option<String> {
-        if !self.rti.killed && !self.federates.iter().any(|member| member.killed) {
+        if self.killed.is_empty() {
             return None;
         }
-        let missed = |member: &&Member| member.killed || terminated.contains(&member.name);
-        let names: Vec<_> = self.federates.iter().filter(missed).collect();
+        let missed =
+            |id: &MemberId| self.killed.contains(id) || terminated.contains(&self.member(*id).name);
+        let late: Vec<_> = self.federate_ids().filter(missed).collect();
         // Without federates it is the RTI that hung.
-        let names = if names.is_empty() {
-            vec![&self.rti]
+        let late = if late.is_empty() {
+            vec![MemberId::Rti]
         } else {
-            names
+            late
         };
-        let names: Vec<_> = names.iter().map(|member| member.name.as_str()).collect();
+        let names: Vec<_> = late
+            .iter()
+            .map(|id| self.member(*id).name.as_str())
+            .collect();
         Some(format!(
             "did not reach the stop tag in time: {}",
             names.join(", ")

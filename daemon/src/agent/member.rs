@@ -16,8 +16,6 @@ pub(super) struct Member {
     pub(super) view: MemberView,
     pub(super) reason: Option<String>,
     pub(super) signalled: Option<StopSignal>,
-    /// SIGKILL was sent before it ended in order.
-    pub(super) killed: bool,
 }
 
 /// Where a member's process stands.
@@ -51,7 +49,6 @@ impl Member {
             },
             reason: None,
             signalled: None,
-            killed: false,
         }
     }
 

@@ -132,8 +132,9 @@ impl Agent {
                     .view
                     .ending
                     .get_or_insert_with(|| "did not end after SIGKILL".to_owned());
-                member.killed |= member.process != Process::Gone;
-                member.process = Process::Gone;
+                if std::mem::replace(&mut member.process, Process::Gone) != Process::Gone {
+                    self.killed.insert(id);
+                }
             }
         }
     }
