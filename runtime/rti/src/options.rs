@@ -12,6 +12,12 @@ pub const DEFAULT_PORT: u16 = 15045;
 pub const DEFAULT_FEDERATION: &str = "Unidentified Federation";
 /// LF's default number of clock exchanges; compiled into its federates.
 const DEFAULT_EXCHANGES: u32 = 10;
+/// LF's launchers write this where an option is left out; LF's RTI skips it.
+const BLANK: &str = " ";
+/// A payload's length is a signed 32-bit number on the wire.
+const LONGEST_PAYLOAD: u32 = i32::MAX.cast_unsigned();
+/// A terabyte: no output queue is longer.
+const LARGEST_OUTPUT: u64 = 1 << 40;
 
 const HELP: &str = "\
 Usage: ictus rti -n N [OPTION]...
@@ -21,11 +27,16 @@ Coordinates one federation; takes the options of Lingua Franca's RTI.
   -i, --id ID                   the federation's id
   -p, --port PORT               TCP port (default 15045; 0: any free one)
       --bind ADDRESS            address to listen on (default 127.0.0.1)
-  -c, --clock_sync off|init|on [period NS] [exchanges-per-interval K]
-                                compare clocks while federates join (default off; `on` is `init`)
+  -c, --clock_sync off|init|initial|on [period NS] [exchanges-per-interval K]
+                                compare clocks while federates join (default off; `initial` and `on` are
+                                `init`)
   -d, --dnet_disabled           send no downstream next event tags
   -m, --start-time-multiple VALUE UNIT
-                                round the start time up to a multiple
+                                round the start time up to a multiple; units from ns to weeks
+      --max-payload SIZE        the longest payload of one message, in bytes or with K, M or G
+                                (default 64M); a longer one fails its sender
+      --max-output SIZE         the most that may wait for one federate (default 256M); more ends the
+                                federation
       --status-fd FD            write one JSON object a line to this inherited descriptor
   -v, --version
   -h, --help";
@@ -146,6 +157,8 @@ impl Parser {
     /// Takes one option with its values; gives a text when only that is wanted.
     fn take(&mut self, option: &str) -> Result<Option<String>, UsageError> {
         match option {
+            // LF's launchers leave empty places.
+            BLANK => {}
             "-i" | "--id" => self.options.config.federation = self.federation(option)?,
             "-n" | "--number_of_federates" => {
                 self.options.config.federates = self.number_of_federates(option)?;
@@ -156,6 +169,14 @@ impl Parser {
             "-d" | "--dnet_disabled" => self.options.config.dnet = false,
             "-m" | "--start-time-multiple" => {
                 self.options.config.start_multiple = Some(self.multiple(option)?);
+            }
+            "--max-payload" => {
+                let size = self.size(option, u64::from(LONGEST_PAYLOAD))?;
+                self.options.config.max_payload = u32::try_from(size).unwrap_or(LONGEST_PAYLOAD);
+            }
+            "--max-output" => {
+                let size = self.size(option, LARGEST_OUTPUT)?;
+                self.options.config.max_output = usize::try_from(size).unwrap_or(usize::MAX);
             }
             "--status-fd" => {
                 self.options.status_fd = Some(self.number(option, "a descriptor's number")?);
@@ -193,6 +214,35 @@ impl Parser {
         value.parse().or_else(|_| invalid(option, expected, value))
     }
 
+    /// A number of bytes from 1 to `most`, with a unit of 1024, its square or its cube.
+    fn size(&mut self, option: &str, most: u64) -> Result<u64, UsageError> {
+        let value = self.value(option)?;
+        let (digits, unit) = match value.strip_suffix(['K', 'k', 'M', 'm', 'G', 'g']) {
+            Some(digits) => (digits, value[digits.len()..].to_ascii_uppercase()),
+            None => (value.as_str(), String::new()),
+        };
+        let unit: u64 = match unit.as_str() {
+            "K" => 1 << 10,
+            "M" => 1 << 20,
+            "G" => 1 << 30,
+            _ => 1,
+        };
+        let number = digits.parse().ok().filter(|_| !digits.starts_with('+'));
+        number
+            .and_then(|number: u64| number.checked_mul(unit))
+            .filter(|size| (1..=most).contains(size))
+            .map_or_else(
+                || {
+                    invalid(
+                        option,
+                        "a size in bytes, such as 1000, 64K, 64M or 1G",
+                        value.clone(),
+                    )
+                },
+                Ok,
+            )
+    }
+
     fn federation(&mut self, option: &str) -> Result<String, UsageError> {
         let value = self.value(option)?;
         if value.len() > usize::from(u8::MAX) {
@@ -214,24 +264,24 @@ impl Parser {
         let mut exchanges = DEFAULT_EXCHANGES;
         while let Some(key) = self
             .arguments
-            .next_if(|word| word == "period" || word == "exchanges-per-interval")
+            .next_if(|word| matches!(word.as_str(), "period" | "exchanges-per-interval" | BLANK))
         {
-            if key == "period" {
-                let _period: u64 = self.number(&key, "nanoseconds")?;
-            } else {
-                exchanges = self.number(&key, "a number")?;
+            match key.as_str() {
+                BLANK => {}
+                "period" => drop(self.number::<u64>(&key, "nanoseconds")?),
+                _ => exchanges = self.number(&key, "a number")?,
             }
         }
         self.options.config.clock_exchanges = match mode.as_str() {
             "off" => 0,
-            "init" => exchanges,
+            "init" | "initial" => exchanges,
             "on" => {
                 let warning =
                     "clocks are compared while federates join, not later: `-c on` is `-c init`";
                 self.options.warnings.push(warning.to_owned());
                 exchanges
             }
-            _ => return invalid(option, "off, init or on", mode),
+            _ => return invalid(option, "off, init, initial or on", mode),
         };
         Ok(())
     }
@@ -245,7 +295,10 @@ impl Parser {
             "ms" | "msec" | "msecs" => 1_000_000,
             "s" | "sec" | "secs" | "second" | "seconds" => 1_000_000_000,
             "min" | "mins" | "minute" | "minutes" => 60_000_000_000,
-            _ => return invalid(option, "a unit (ns, us, ms, s, min)", unit),
+            "h" | "hour" | "hours" => 3_600_000_000_000,
+            "d" | "day" | "days" => 24 * 3_600_000_000_000,
+            "week" | "weeks" => 7 * 24 * 3_600_000_000_000,
+            _ => return invalid(option, "a unit (ns, us, ms, s, min, hour, day, week)", unit),
         };
         match value.checked_mul(nanos) {
             Some(nanos) if nanos > 0 => Ok(Duration::from_nanos(nanos)),
@@ -312,6 +365,46 @@ mod tests {
     }
 
     #[test]
+    fn what_lf_takes() {
+        let hours = 3600;
+        let units = [
+            ("1 hour", hours),
+            ("2 hours", 2 * hours),
+            ("1 day", 24 * hours),
+            ("2 days", 48 * hours),
+            ("1 week", 168 * hours),
+            ("2 weeks", 336 * hours),
+        ];
+        for (multiple, seconds) in units {
+            let options = parse(&format!("-n 1 -m {multiple}")).unwrap();
+            let expected = Some(Duration::from_secs(seconds));
+            assert_eq!(options.config.start_multiple, expected, "{multiple}");
+        }
+        assert_eq!(parse("-n 1 -c initial").unwrap().config.clock_exchanges, 10);
+        let line = " |-n|2| |-c|init| |exchanges-per-interval|4| |-d| ";
+        let arguments = line.split('|').map(OsString::from);
+        let Ok(Command::Run(options)) = Options::parse(arguments) else {
+            panic!("blanks are skipped");
+        };
+        assert_eq!(options.config.federates, 2);
+        assert_eq!(options.config.clock_exchanges, 4);
+        assert!(!options.config.dnet);
+    }
+
+    #[test]
+    fn limits_are_sizes() {
+        let sizes = |line: &str| {
+            let config = parse(line).unwrap().config;
+            (config.max_payload, config.max_output)
+        };
+        assert_eq!(sizes("-n 1"), (64 << 20, 256 << 20));
+        let line = "-n 1 --max-payload 1000 --max-output 3G";
+        assert_eq!(sizes(line), (1000, 3 << 30));
+        let line = "-n 1 --max-payload 4k --max-output 1M";
+        assert_eq!(sizes(line), (4096, 1 << 20));
+    }
+
+    #[test]
     fn mistakes_are_named() {
         let table = [
             ("", "`-n N` is missing: how many federates join?"),
@@ -320,7 +413,7 @@ mod tests {
             ("-n", "`-n` needs a value"),
             (
                 "-n 1 -c sometimes",
-                "`-c` takes off, init or on, not `sometimes`",
+                "`-c` takes off, init, initial or on, not `sometimes`",
             ),
             (
                 "-n 1 -a",
@@ -337,6 +430,22 @@ mod tests {
             (
                 "-n 1 -p 70000",
                 "`-p` takes a port (0 to 65535), not `70000`",
+            ),
+            (
+                "-n 1 --max-output 0",
+                "`--max-output` takes a size in bytes, such as 1000, 64K, 64M or 1G, not `0`",
+            ),
+            (
+                "-n 1 --max-payload 2G",
+                "`--max-payload` takes a size in bytes, such as 1000, 64K, 64M or 1G, not `2G`",
+            ),
+            (
+                "-n 1 --max-payload M",
+                "`--max-payload` takes a size in bytes, such as 1000, 64K, 64M or 1G, not `M`",
+            ),
+            (
+                "-n 1 -m 1 fortnight",
+                "`-m` takes a unit (ns, us, ms, s, min, hour, day, week), not `fortnight`",
             ),
             ("-n 1 -m 0 ms", "`-m` takes a positive time, not `0 ms`"),
         ];
