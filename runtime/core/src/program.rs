@@ -233,6 +233,13 @@ impl ProgramBuilder {
         PortId::new(self.ports.len() - 1)
     }
 
+    /// The reactor that has a port, and the port's kind.
+    #[must_use]
+    pub fn owner(&self, port: PortId) -> (ReactorId, PortKind) {
+        let port = &self.ports[port.index()];
+        (port.reactor, port.kind)
+    }
+
     /// Adds a timer or an action.
     pub fn action(&mut self, kind: ActionKind) -> ActionId {
         self.actions.push(kind);
@@ -273,7 +280,9 @@ impl ProgramBuilder {
         OutputId::new(self.outputs.len() - 1)
     }
 
-    fn port_path(&self, port: PortId) -> String {
+    /// A port's path, for messages.
+    #[must_use]
+    pub fn port_path(&self, port: PortId) -> String {
         let port = &self.ports[port.index()];
         join_path(&self.reactors[port.reactor.index()].path, &port.name)
     }

@@ -59,6 +59,19 @@ pub enum WiringError {
         /// The span.
         span: Duration,
     },
+    /// A connection that runs against the grain.
+    #[error(
+        "{path}: no connection can go {side} {port}: connections go from a child's output or an own port \
+         to a child's input or an own output"
+    )]
+    Direction {
+        /// The container.
+        path: String,
+        /// `from` or `to`.
+        side: &'static str,
+        /// The port that is at the wrong end.
+        port: String,
+    },
     /// A multiport is connected to one of another width.
     #[error("{path}: a connection joins {from} channels to {to}")]
     Widths {
@@ -342,7 +355,7 @@ impl<R: 'static> ReactionScope<'_, R> {
     pub fn connections(&mut self, wire: impl FnOnce(&mut Wiring)) {
         let mut wiring = Wiring::default();
         wire(&mut wiring);
-        wiring.apply(&self.scope.path, self.scope.elaboration);
+        wiring.apply(self.scope.reactor, &self.scope.path, self.scope.elaboration);
     }
 }
 

@@ -4,7 +4,7 @@ use crate::carrier::{PortType, Typed};
 use crate::port::{Input, Multi, Output};
 use crate::scope::{Elaboration, WiringError};
 use crate::value::Value;
-use ictus_core::{Delay, Duration, PortId};
+use ictus_core::{Delay, Duration, PortId, PortKind, ReactorId};
 use std::fmt;
 
 /// Collects the connections of one reactor.
@@ -73,7 +73,8 @@ impl Wiring {
         self.links.last_mut().expect("one was pushed")
     }
 
-    pub(crate) fn apply(self, path: &str, elaboration: &mut Elaboration) {
+    /// Adds the connections of the container `reactor`, whose path is `path`.
+    pub(crate) fn apply(self, reactor: ReactorId, path: &str, elaboration: &mut Elaboration) {
         for link in self.links {
             let fits = if link.broadcast {
                 link.to.is_empty() || !link.from.is_empty()
@@ -88,6 +89,10 @@ impl Wiring {
                 });
                 continue;
             }
+            if let Some(error) = link.misdirected(reactor, path, elaboration) {
+                elaboration.errors.push(error);
+                continue;
+            }
             for ends in link.from.iter().copied().cycle().zip(link.to) {
                 elaboration.connect(ends, link.delay, &*link.typed);
             }
@@ -96,6 +101,36 @@ impl Wiring {
 }
 
 impl Link {
+    /// A connection goes from a child's output or an own port to a child's input or an own output.
+    fn misdirected(
+        &self,
+        reactor: ReactorId,
+        path: &str,
+        elaboration: &Elaboration,
+    ) -> Option<WiringError> {
+        let is = |port: &PortId, own: Option<PortKind>, child: PortKind| {
+            let (owner, kind) = elaboration.program.owner(*port);
+            if owner == reactor {
+                own.is_none_or(|own| kind == own)
+            } else {
+                kind == child
+            }
+        };
+        let (mut from, mut to) = (self.from.iter(), self.to.iter());
+        let wrong_from = from.find(|p| !is(p, None, PortKind::Output));
+        let wrong_to = to.find(|p| !is(p, Some(PortKind::Output), PortKind::Input));
+        let (port, side) = match (wrong_from, wrong_to) {
+            (Some(port), _) => (port, "from"),
+            (None, Some(port)) => (port, "to"),
+            (None, None) => return None,
+        };
+        Some(WiringError::Direction {
+            path: path.to_owned(),
+            side,
+            port: elaboration.program.port_path(*port),
+        })
+    }
+
     /// Delays the connection; zero is one microstep, which is not the same as no delay.
     pub const fn after(&mut self, delay: Duration) {
         self.delay = Delay::after(delay);

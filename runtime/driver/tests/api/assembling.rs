@@ -226,3 +226,53 @@ fn a_connection_of_different_widths_is_refused() {
     let uneven = World::of(Class::of::<Uneven>());
     assert_eq!(error(&uneven), "main: a connection joins 2 channels to 3");
 }
+
+#[reactor]
+struct Inner {
+    #[param]
+    label: String,
+    #[param(default = 0)]
+    index: usize,
+    input: Input<u32>,
+    out: Output<u32>,
+}
+
+#[reactions]
+impl Inner {
+    #[reaction]
+    fn pass(&mut self, input: &Input<u32>, out: &mut Output<u32>) {
+        assert_eq!(self.label, format!("of {}", self.index));
+        out.set(*input.get().unwrap());
+    }
+}
+
+/// A bank whose members get parameters of the container, and a connection the wrong way round.
+#[reactor]
+struct Backwards {
+    #[param(default = "of".to_owned())]
+    prefix: String,
+    input: Input<u32>,
+    #[child(|i| Inner { label: format!("{prefix} {i}"), index: i })]
+    #[width = 2]
+    bank: Bank<Inner>,
+    out: Output<u32>,
+}
+
+#[reactions]
+impl Backwards {
+    #[connections]
+    fn wire(c: &mut Wiring, input: &Input<u32>, bank: &Bank<Inner>, out: &Output<u32>) {
+        c.connect(&bank[0].input, input);
+        c.connect(&bank[1].out, out);
+    }
+}
+
+#[test]
+fn a_connection_against_the_grain_is_refused() {
+    let world = World::of(Class::of::<Backwards>());
+    let error = world.assemble().unwrap_err().to_string();
+    assert!(
+        error.starts_with("main: no connection can go from main.bank[0].input"),
+        "{error}"
+    );
+}

@@ -467,7 +467,12 @@ impl<'a> Class<'a> {
                 width,
             } => {
                 let given = match given {
-                    Some(given @ Expr::Closure(_)) => given::parameters(class, Some(given)),
+                    // Called once for each member: it owns copies of the parameters, and each call gets its own.
+                    Some(Expr::Closure(closure)) => {
+                        let body = given::parameters(class, Some(&closure.body));
+                        let (body, inputs) = (self.with_parameters(&body), &closure.inputs);
+                        quote_spanned!(closure.span()=> move |#inputs| #body)
+                    }
                     other => {
                         let given = given::parameters(class, other.as_ref());
                         quote!(|_| #given)
@@ -504,12 +509,13 @@ impl<'a> Class<'a> {
     }
 }
 
-/// Whether an identifier occurs in the tokens.
+/// Whether an identifier occurs in the tokens, also as `{name}` in a format string.
 fn mentions(tokens: TokenStream, name: &Ident) -> bool {
     tokens.into_iter().any(|token| match token {
         TokenTree::Ident(ident) => ident == *name,
         TokenTree::Group(group) => mentions(group.stream(), name),
-        TokenTree::Punct(_) | TokenTree::Literal(_) => false,
+        TokenTree::Literal(literal) => literal.to_string().contains(&format!("{{{name}")),
+        TokenTree::Punct(_) => false,
     })
 }
 
