@@ -1,16 +1,21 @@
 //! All federations of this host: which live, which are only on disk.
 
 use std::collections::BTreeMap;
+use std::path::PathBuf;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use tokio::sync::{broadcast, watch};
 use tokio::time::Instant;
 
 use crate::agent::RTI;
-use crate::api::{ApiError, ErrorCode, FederationView, Happening, Removed, StartRequest};
+use crate::api::{
+    ApiError, ErrorCode, Failure, FailureKind, FederationView, Happening, MemberView, Outcome,
+    Removed, StartRequest, State,
+};
 use crate::federation::{BeginError, Command, Federation, Handle};
 use crate::paths::Paths;
-use crate::store::{self, Directory, StoreError};
+use crate::store::{self, Directory, Record, StoreError};
+use crate::{rescue, stamp};
 
 /// Events that a slow follower may miss before it is disconnected.
 const EVENTS_MAX: usize = 4096;
@@ -48,7 +53,7 @@ impl Host {
     pub(crate) fn adopt_all(&self) {
         for name in store::names(&self.0.paths.federations()) {
             let directory = self.directory(&name);
-            match directory.read_record() {
+            match recorded(&name, &directory) {
                 Ok(Some(record)) if record.view.outcome.is_none() => {
                     let told = self.0.told.clone();
                     match Federation::adopt(&self.0.paths, directory, record, told) {
@@ -78,6 +83,7 @@ impl Host {
                 known: Vec::new(),
             });
         }
+        self.check_driven(name)?;
         let told = self.0.told.clone();
         let (federation, handle) = Federation::start(&self.0.paths, name, request, told)
             .map_err(|error| begin_error(&error))?;
@@ -101,19 +107,17 @@ impl Host {
             return Ok(handle.view.borrow().clone());
         }
         self.check_known(name)?;
-        let record = self
-            .directory(name)
-            .read_record()
-            .map_err(|error| store_error(&error))?;
-        record
-            .map(|record| record.view)
-            .ok_or_else(|| self.unknown(name))
+        let directory = self.directory(name);
+        match recorded(name, &directory) {
+            Ok(Some(record)) => Ok(record.view),
+            Ok(None) => Err(self.unknown(name)),
+            Err(error) => Ok(unreadable_view(name, &directory, &error)),
+        }
     }
 
     /// Every federation that lives or has ended and was not taken down.
     pub(crate) fn views(&self) -> Vec<FederationView> {
-        let names = store::names(&self.0.paths.federations());
-        names
+        self.names()
             .iter()
             .filter_map(|name| self.view(name).ok())
             .collect()
@@ -135,6 +139,7 @@ impl Host {
             while handle.view.changed().await.is_ok() {}
             outcome = handle.view.borrow().outcome.clone();
         }
+        self.check_driven(name)?;
         let kept = self
             .directory(name)
             .remove(purge)
@@ -153,7 +158,7 @@ impl Host {
 
     /// When something was last asked for or owned.
     pub(crate) fn last_active(&self) -> Instant {
-        if !self.living().is_empty() {
+        if self.owns_something() {
             self.touch();
         }
         *self.0.active.borrow()
@@ -161,7 +166,7 @@ impl Host {
 
     /// Ends the daemon if it owns nothing; tells whether it does.
     pub(crate) fn end_if_idle(&self) -> bool {
-        let idle = self.living().is_empty();
+        let idle = !self.owns_something();
         if idle {
             self.0.end.send_replace(true);
         }
@@ -189,8 +194,58 @@ impl Host {
         Directory::of(&self.0.paths.federations(), name)
     }
 
+    /// Names of federations that live or have anything on disk, sorted.
+    pub(crate) fn names(&self) -> Vec<String> {
+        let mut names = store::names(&self.0.paths.federations());
+        // Somebody may have removed the directory of one that lives.
+        names.extend(self.living().keys().cloned());
+        names.sort();
+        names.dedup();
+        names
+    }
+
+    /// Whether anything runs that would have nobody to stop it without a daemon.
+    fn owns_something(&self) -> bool {
+        let undriven = |name: &String| self.check_driven(name).is_err();
+        !self.living().is_empty() || self.names().iter().any(undriven)
+    }
+
+    /// Refuses when processes of a run live that this daemon cannot drive.
+    fn check_driven(&self, name: &str) -> Result<(), ApiError> {
+        let directory = self.directory(name);
+        let why = match recorded(name, &directory) {
+            Ok(Some(record)) if record.view.outcome.is_some() => return Ok(()),
+            Ok(Some(_)) => directory.read_request().map(|_| ()),
+            Ok(None) => Ok(()),
+            Err(error) => Err(error),
+        };
+        let why = why.map_or_else(
+            |error| with_sources(&error),
+            |()| format!("{} is incomplete", directory.path().display()),
+        );
+        let living = rescue::living(&directory);
+        if living.is_empty() {
+            return Ok(());
+        }
+        let pid = |pid: &Option<i32>| pid.map_or_else(|| "unknown".to_owned(), |it| it.to_string());
+        let living: Vec<_> = living
+            .iter()
+            .map(|(member, id)| format!("{member} (supervisor {})", pid(id)))
+            .collect();
+        Err(ApiError {
+            code: ErrorCode::Failed,
+            message: format!(
+                "federation `{name}` runs, but cannot be driven: {why}; use the version that wrote it, or \
+                 end its supervisors with `kill`: {}",
+                living.join(", ")
+            ),
+            known: Vec::new(),
+        })
+    }
+
     fn check_known(&self, name: &str) -> Result<(), ApiError> {
-        let known = store::is_name(name) && self.directory(name).path().is_dir();
+        let known = store::is_name(name)
+            && (self.directory(name).path().is_dir() || self.living().contains_key(name));
         if known {
             Ok(())
         } else {
@@ -202,13 +257,52 @@ impl Host {
         ApiError {
             code: ErrorCode::Unknown,
             message: format!("there is no federation `{name}`"),
-            known: store::names(&self.0.paths.federations()),
+            known: self.names(),
         }
     }
 
     fn living(&self) -> MutexGuard<'_, BTreeMap<String, Handle>> {
         // The map is consistent after every operation on it.
         self.0.living.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+/// The record, made again when it is damaged; absent when the run was taken down.
+fn recorded(name: &str, directory: &Directory) -> Result<Option<Record>, StoreError> {
+    match directory.read_record() {
+        Ok(None) => Ok(rescue::record(name, directory)),
+        Err(error @ (StoreError::Damaged { .. } | StoreError::Io { .. })) => {
+            rescue::record(name, directory).map(Some).ok_or(error)
+        }
+        read => read,
+    }
+}
+
+/// What can be said of a run whose record cannot be used.
+fn unreadable_view(name: &str, directory: &Directory, error: &StoreError) -> FederationView {
+    let living = !rescue::living(directory).is_empty();
+    FederationView {
+        name: name.to_owned(),
+        state: if living { State::Running } else { State::Ended },
+        id: String::new(),
+        since_ns: stamp::now_ns(),
+        manifest: PathBuf::new(),
+        directory: directory.path().to_path_buf(),
+        rti_port: None,
+        start_ns: None,
+        rti: MemberView::default(),
+        federates: Vec::new(),
+        outcome: Some(Outcome::Failed {
+            failure: Failure {
+                kind: FailureKind::Process,
+                member: None,
+                what: format!("unreadable: {}", with_sources(error)),
+                lines: Vec::new(),
+                log: None,
+                at_ns: stamp::now_ns(),
+            },
+            was_healthy: true,
+        }),
     }
 }
 

@@ -16,6 +16,7 @@ pub mod identity;
 pub mod logs;
 pub mod paths;
 mod process;
+mod rescue;
 mod server;
 pub mod stamp;
 pub mod store;

@@ -293,7 +293,7 @@ async fn events(
     let mut kept = Vec::new();
     let names = match &query.federation {
         Some(name) => vec![name.clone()],
-        None => crate::store::names(&host.paths().federations()),
+        None => host.names(),
     };
     for name in names {
         kept.extend(host.known_directory(&name)?.events_kept());

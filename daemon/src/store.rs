@@ -146,7 +146,11 @@ impl Directory {
     /// A member's supervisor's spec.
     #[must_use]
     pub fn spec(&self, member: &str) -> PathBuf {
-        self.0.join("spec").join(format!("{member}.json"))
+        self.specs().join(format!("{member}.json"))
+    }
+
+    pub(crate) fn specs(&self) -> PathBuf {
+        self.0.join("spec")
     }
 
     fn request(&self) -> PathBuf {
@@ -168,13 +172,7 @@ impl Directory {
     pub fn prepare(&self, request: &StartRequest) -> Result<(), StoreError> {
         files::remove(&self.0).map_err(io_at(&self.0))?;
         let exit = self.0.join("exit");
-        for directory in [
-            self.logs(),
-            self.trace(),
-            self.timing(),
-            exit,
-            self.0.join("spec"),
-        ] {
+        for directory in [self.logs(), self.trace(), self.timing(), exit, self.specs()] {
             let mut builder = DirBuilder::new();
             builder
                 .recursive(true)
@@ -259,7 +257,7 @@ impl Directory {
             files::remove(&self.0).map_err(io_at(&self.0))?;
             return Ok(Vec::new());
         }
-        for path in [self.request(), self.record(), self.0.join("spec")] {
+        for path in [self.request(), self.record(), self.specs()] {
             files::remove(&path).map_err(io_at(&path))?;
         }
         let filled = |path: &PathBuf| fs::read_dir(path).is_ok_and(|mut it| it.next().is_some());

@@ -272,6 +272,105 @@ async fn a_deaf_federate_is_killed_and_said_to_have_missed_the_stop_tag() {
 }
 
 #[tokio::test]
+async fn a_run_whose_record_is_damaged_is_adopted_from_what_else_is_there() {
+    for text in ["", "{\"protocol\": 1, \"mem"] {
+        let mut world = World::new().await;
+        let pair = world
+            .start_healthy("pair", &federation(&[("a", ""), ("b", "")]))
+            .await;
+        let before = world.client.federation("pair").await.unwrap();
+        world.kill_daemon();
+        fs::write(world.directory("pair").join("record.json"), text).unwrap();
+        world.replace_daemon_after_end().await;
+        let view = world.client.federation("pair").await.unwrap();
+        assert_eq!(
+            (view.state, view.id, view.start_ns),
+            (State::Running, before.id, before.start_ns)
+        );
+        let removed = world.client.remove("pair", false).await.unwrap();
+        let missed = Vec::new();
+        assert_eq!(removed.outcome, Some(Outcome::Stopped { missed }));
+        for process in pair.processes.values() {
+            process.assert_ends();
+        }
+    }
+}
+
+#[tokio::test]
+async fn a_run_of_a_newer_version_is_listed_and_neither_taken_down_nor_left_without_a_daemon() {
+    let mut world = World::new().await;
+    let pair = world
+        .start_healthy("pair", &federation(&[("a", ""), ("b", "")]))
+        .await;
+    world.kill_daemon();
+    let path = world.directory("pair").join("record.json");
+    let record = fs::read(&path).unwrap();
+    fs::write(&path, "{\"protocol\": 99}").unwrap();
+    world.replace_daemon_after_end().await;
+    let views = world.client.federations().await.unwrap();
+    let Some(Outcome::Failed { failure, .. }) = &views[0].outcome else {
+        panic!("{views:?}")
+    };
+    assert!(failure.what.contains("is of protocol 99"), "{failure:?}");
+    assert_eq!(views[0].state, State::Running);
+    for purge in [false, true] {
+        let error = world.client.remove("pair", purge).await.unwrap_err();
+        let said = error.to_string();
+        assert!(said.contains(path.to_str().unwrap()), "{said}");
+        assert!(said.contains("rti (supervisor "), "{said}");
+    }
+    let request = federation(&[("a", "")]);
+    assert!(world.client.start("pair", &request).await.is_err());
+    assert!(!world.client.end().await.unwrap(), "it is still needed");
+    for process in pair.processes.values() {
+        process.assert_lives();
+    }
+    world.kill_daemon();
+    fs::write(&path, record).unwrap();
+    world.replace_daemon_after_end().await;
+    world.client.remove("pair", true).await.unwrap();
+    pair.processes["a"].assert_ends();
+}
+
+#[tokio::test]
+async fn a_run_whose_request_is_damaged_is_not_taken_down_while_it_runs() {
+    let mut world = World::new().await;
+    let pair = world
+        .start_healthy("pair", &federation(&[("a", ""), ("b", "")]))
+        .await;
+    world.kill_daemon();
+    let path = world.directory("pair").join("request.json");
+    fs::write(&path, "").unwrap();
+    world.replace_daemon_after_end().await;
+    let error = world.client.remove("pair", false).await.unwrap_err();
+    assert!(
+        error.to_string().contains(path.to_str().unwrap()),
+        "{error}"
+    );
+    pair.processes["a"].kill();
+    for process in pair.processes.values() {
+        process.assert_ends();
+    }
+}
+
+#[tokio::test]
+async fn a_run_whose_directory_was_removed_is_still_listed_and_stopped() {
+    let world = World::new().await;
+    let pair = world
+        .start_healthy("pair", &federation(&[("a", ""), ("b", "")]))
+        .await;
+    fs::remove_dir_all(world.directory("pair")).unwrap();
+    let views = world.client.federations().await.unwrap();
+    assert_eq!((views.len(), views[0].state), (1, State::Running));
+    let removed = world.client.remove("pair", false).await.unwrap();
+    let missed = Vec::new();
+    assert_eq!(removed.outcome, Some(Outcome::Stopped { missed }));
+    for process in pair.processes.values() {
+        process.assert_ends();
+    }
+}
+
+#[tokio::test]
 async fn a_program_that_ends_by_itself_is_completed() {
     let world = World::new().await;
     let request = federation(&[("a", "short"), ("b", "short")]);
