@@ -34,7 +34,8 @@ Coordinates one federation; takes the options of Lingua Franca's RTI.
   -m, --start-time-multiple VALUE UNIT
                                 round the start time up to a multiple; units from ns to weeks
       --max-payload SIZE        the longest payload of one message, in bytes or with K, M or G
-                                (default 64M); a longer one fails its sender
+                                (default 64M); a longer one fails its sender; Ictus programs
+                                themselves take no longer ones than 64M
       --max-output SIZE         the most that may wait for one federate (default 256M); more ends the
                                 federation
       --status-fd FD            write one JSON object a line to this inherited descriptor

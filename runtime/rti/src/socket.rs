@@ -11,6 +11,8 @@ use mio::net::TcpStream;
 pub(crate) const READ: usize = 256 << 10;
 /// Leftovers up to this size are moved to the front of the shared buffer rather than read behind (bytes).
 const SMALL: usize = 64 << 10;
+/// The most that is read from a peer that we have taken leave of (bytes): it may be writing before it reads that.
+const FAREWELL: usize = 4 << 20;
 
 /// A connection's socket and what it has sent of an incomplete message.
 #[derive(Debug)]
@@ -22,6 +24,10 @@ pub(crate) struct Socket {
     /// The peer has closed its half, or the connection is broken: read to the end.
     pub(crate) read_to_end: bool,
     writing: Writing,
+    /// The state machine takes leave of the peer.
+    leaving: bool,
+    /// Bytes read since then.
+    farewell: usize,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -58,6 +64,8 @@ impl Socket {
             readable: true,
             read_to_end: false,
             writing: Writing::Open,
+            leaving: false,
+            farewell: 0,
         }
     }
 
@@ -65,7 +73,8 @@ impl Socket {
         &mut self.stream
     }
 
-    /// Reads once, at most [`READ`] bytes, and hands complete messages to the state machine.
+    /// Reads once, at most [`READ`] bytes, and hands complete messages to the state machine. A peer that goes on sending
+    /// after [`FAREWELL`] is read no more; the connection ends as soon as all is written.
     pub(crate) fn receive(
         &mut self,
         rti: &mut Rti,
@@ -73,6 +82,14 @@ impl Socket {
         id: ConnectionId,
         buffer: &mut [u8],
     ) -> Received {
+        self.leaving = rti.output(id).closing() != Closing::Open;
+        if self.farewell >= FAREWELL {
+            self.readable = false;
+            return match self.writing {
+                Writing::Open => Received::Open,
+                Writing::Shut | Writing::Broken => Received::Ended(Disconnect::Eof),
+            };
+        }
         if self.leftover.len() > SMALL {
             return self.receive_behind(rti, now, id);
         }
@@ -121,6 +138,9 @@ impl Socket {
             Ok(0) => Err(Disconnect::Eof),
             Ok(read) => {
                 self.readable = read == room || self.read_to_end;
+                if self.leaving {
+                    self.farewell += read;
+                }
                 Ok(read)
             }
             Err(error) if error.kind() == ErrorKind::Interrupted => Ok(0),
@@ -159,6 +179,9 @@ impl Socket {
             self.writing = Writing::Shut;
             // A peer that is gone already needs no farewell.
             let _gone = self.stream.shutdown(Shutdown::Write);
+            if self.farewell >= FAREWELL {
+                return Flushed::Close;
+            }
         }
         Flushed::Open
     }

@@ -336,6 +336,24 @@ fn a_vanished_federate_ends_the_federation() {
 }
 
 #[test]
+fn a_peer_that_has_failed_is_not_read_for_long() {
+    const BLOCK: usize = 1 << 20;
+    let rti = serve(Options::new("test", 1));
+    let mut flood = rti.join(0, &[], &[]);
+    flood.start();
+    flood.stream.write_all(&[99]).unwrap();
+    assert_eq!(flood.next().unwrap(), "Failed");
+    let block = vec![0; BLOCK];
+    let mut taken = 0;
+    while flood.stream.write_all(&block).is_ok() {
+        taken += BLOCK;
+    }
+    // The sockets hold some as well.
+    assert!(taken < 64 << 20, "{taken} bytes were taken");
+    assert_eq!(rti.ended(), 1);
+}
+
+#[test]
 fn a_port_in_use_is_named() {
     let other = TcpListener::bind("127.0.0.1:0").unwrap();
     let port = other.local_addr().unwrap().port();
