@@ -26,7 +26,8 @@ Coordinates one federation; takes the options of Lingua Franca's RTI.
   -n, --number_of_federates N   how many federates join (required)
   -i, --id ID                   the federation's id
   -p, --port PORT               TCP port (default 15045; 0: any free one)
-      --bind ADDRESS            address to listen on (default 127.0.0.1)
+      --bind ADDRESS            address to listen on (default 127.0.0.1, for this host alone; LF's RTI:
+                                0.0.0.0, for all)
   -c, --clock_sync off|init|initial|on [period NS] [exchanges-per-interval K]
                                 compare clocks while federates join (default off; `initial` and `on` are
                                 `init`)
@@ -58,6 +59,8 @@ pub struct Options {
     pub config: RtiConfig,
     /// The address to listen on.
     pub bind: IpAddr,
+    /// Whether nobody chose that address.
+    pub bind_is_default: bool,
     /// The TCP port to listen on; 0: the system chooses one.
     pub port: u16,
     /// The inherited descriptor for status lines.
@@ -108,6 +111,7 @@ impl Options {
         Self {
             config: RtiConfig::new(federation, federates),
             bind: IpAddr::V4(Ipv4Addr::LOCALHOST),
+            bind_is_default: true,
             port: 0,
             status_fd: None,
             warnings: Vec::new(),
@@ -165,7 +169,10 @@ impl Parser {
                 self.options.config.federates = self.number_of_federates(option)?;
             }
             "-p" | "--port" => self.options.port = self.number(option, "a port (0 to 65535)")?,
-            "--bind" => self.options.bind = self.number(option, "an IP address")?,
+            "--bind" => {
+                self.options.bind = self.number(option, "an IP address")?;
+                self.options.bind_is_default = false;
+            }
             "-c" | "--clock_sync" => self.clock_sync(option)?,
             "-d" | "--dnet_disabled" => self.options.config.dnet = false,
             "-m" | "--start-time-multiple" => {
@@ -362,6 +369,7 @@ mod tests {
                 .unwrap();
         assert_eq!((options.port, options.status_fd), (0, Some(3)));
         assert_eq!(options.bind, IpAddr::V4(Ipv4Addr::UNSPECIFIED));
+        assert!(!options.bind_is_default && parse("-n 1").unwrap().bind_is_default);
         assert_eq!(options.config.start_multiple, Some(Duration::from_secs(2)));
     }
 

@@ -41,6 +41,8 @@ pub struct Server {
     status: Status,
     buffer: Vec<u8>,
     port: u16,
+    /// Nobody chose the address: only this host's federates can join.
+    bind_is_default: bool,
 }
 
 /// Whether connections may be waiting.
@@ -116,6 +118,7 @@ impl Server {
             status,
             buffer: vec![0; 2 * READ],
             port,
+            bind_is_default: options.bind_is_default,
         })
     }
 
@@ -150,7 +153,7 @@ impl Server {
     ///
     /// When the system refuses to wait for events.
     pub fn run(mut self) -> Result<u8, BindError> {
-        self.status.listening(self.port);
+        self.status.listening(self.port, self.bind_is_default);
         let mut events = Events::with_capacity(1024);
         loop {
             match self.poll.poll(&mut events, self.patience()) {

@@ -61,9 +61,14 @@ impl Status {
         }
     }
 
-    /// Says that the listener is open.
-    pub(crate) fn listening(&mut self, port: u16) {
-        self.say(&format!("listening on port {port}"));
+    /// Says that the listener is open; when its address is nobody's choice, how to choose one: LF's RTI listens on all.
+    pub(crate) fn listening(&mut self, port: u16, bind_is_default: bool) {
+        let whose = if bind_is_default {
+            " of 127.0.0.1, for this host alone (`--bind 0.0.0.0`: for all)"
+        } else {
+            ""
+        };
+        self.say(&format!("listening on port {port}{whose}"));
         self.line(&RtiStatus::Listening { port });
     }
 
@@ -237,6 +242,25 @@ mod tests {
         assert!(left_out > 0);
         let told = format!("ictus rti: {left_out} lines were left out here: nobody read");
         assert_eq!(lines[kept..], [told.as_str(), "ictus rti: the end"]);
+    }
+
+    #[test]
+    fn an_address_that_nobody_chose_is_named() {
+        let (mut reader, writer) = io::pipe().unwrap();
+        let mut status = Status {
+            words: Some(Outlet::new(File::from(OwnedFd::from(writer)))),
+            ..Status::default()
+        };
+        status.listening(7, true);
+        status.listening(7, false);
+        drop(status);
+        let mut text = String::new();
+        reader.read_to_string(&mut text).unwrap();
+        let expected = "\
+ictus rti: listening on port 7 of 127.0.0.1, for this host alone (`--bind 0.0.0.0`: for all)
+ictus rti: listening on port 7
+";
+        assert_eq!(text, expected);
     }
 
     #[test]
