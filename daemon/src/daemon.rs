@@ -105,7 +105,7 @@ async fn serve(paths: &Paths) -> Result<(), DaemonError> {
     let mut terminate = signal(SignalKind::terminate()).map_err(system("watch signals"))?;
     let mut interrupt = signal(SignalKind::interrupt()).map_err(system("watch signals"))?;
     let host = Host::new(paths.clone());
-    host.adopt_all();
+    host.adopt_all().await;
     announce()?;
     tracing::info!(socket = %paths.socket().display(), "serving");
     let (end, ended) = tokio::sync::oneshot::channel::<()>();

@@ -2,6 +2,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::io;
+use std::time::Duration;
 
 use tokio::sync::{broadcast, mpsc, watch};
 use tokio::time::{Instant, sleep_until};
@@ -25,6 +26,8 @@ use link::{Heard, Link, Origin};
 const QUEUE_MAX: usize = 256;
 /// Signals waiting for a supervisor's link: at most one SIGTERM and one SIGKILL per rung of the ladder.
 const SIGNALS_MAX: usize = 16;
+/// How long the supervisors of an earlier daemon may take to answer before the view does without them.
+const PROBE_MAX: Duration = Duration::from_secs(2);
 
 /// What a client may ask of a federation.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -43,6 +46,8 @@ pub(crate) struct Handle {
     pub(crate) request: StartRequest,
     pub(crate) commands: mpsc::Sender<Command>,
     pub(crate) view: watch::Receiver<FederationView>,
+    /// Whether the view is this daemon's own and not an earlier one's.
+    pub(crate) probed: watch::Receiver<bool>,
 }
 
 /// Why a federation could not be begun.
@@ -69,6 +74,7 @@ pub(crate) struct Federation {
     hear: mpsc::Sender<Heard>,
     commands: mpsc::Receiver<Command>,
     view: watch::Sender<FederationView>,
+    probed: watch::Sender<bool>,
     told: broadcast::Sender<Happening>,
     /// Members of an earlier daemon that have not said everything that happened before.
     adopting: BTreeSet<MemberId>,
@@ -160,10 +166,12 @@ impl Federation {
         let (hear, heard) = mpsc::channel(QUEUE_MAX);
         let (command, commands) = mpsc::channel(QUEUE_MAX);
         let (view, seen) = watch::channel(record.view.clone());
+        let (probed, first_probe) = watch::channel(false);
         let handle = Handle {
             request: request.clone(),
             commands: command,
             view: seen,
+            probed: first_probe,
         };
         let federation = Self {
             paths,
@@ -176,6 +184,7 @@ impl Federation {
             hear,
             commands,
             view,
+            probed,
             told,
             adopting: BTreeSet::new(),
             told_until_ns: 0,
@@ -200,6 +209,10 @@ impl Federation {
                 () = sleep_until(timeout.unwrap_or(self.origin)), if timeout.is_some() => {
                     self.at_ns = stamp::now_ns();
                     self.agent.handle_timeout(now(self.origin));
+                }
+                () = sleep_until(self.origin + PROBE_MAX), if !self.adopting.is_empty() => {
+                    tracing::warn!(members = ?self.adopting, "supervisors that do not answer");
+                    self.adopting.clear();
                 }
             }
         }
@@ -336,8 +349,9 @@ impl Federation {
         }
         let view = FederationView {
             state: self.agent.state(),
-            rti_port: self.agent.rti_port(),
-            start_ns: self.agent.start_ns(),
+            // Of an RTI that does not answer, what the earlier daemon knew still holds.
+            rti_port: self.agent.rti_port().or(self.record.view.rti_port),
+            start_ns: self.agent.start_ns().or(self.record.view.start_ns),
             rti: self.agent.rti_view(),
             federates: self.agent.federate_views(),
             outcome: self
@@ -358,6 +372,7 @@ impl Federation {
             self.save();
         }
         self.view.send_replace(view);
+        self.probed.send_replace(true);
     }
 
     fn save(&self) {

@@ -49,21 +49,29 @@ impl Host {
         &self.0.paths
     }
 
-    /// Takes over every run that an earlier daemon left.
-    pub(crate) fn adopt_all(&self) {
+    /// Takes over every run that an earlier daemon left; returns when the members of each were looked at.
+    pub(crate) async fn adopt_all(&self) {
+        let mut adopted = Vec::new();
         for name in store::names(&self.0.paths.federations()) {
             let directory = self.directory(&name);
             match recorded(&name, &directory) {
                 Ok(Some(record)) if record.view.outcome.is_none() => {
                     let told = self.0.told.clone();
                     match Federation::adopt(&self.0.paths, directory, record, told) {
-                        Ok((federation, handle)) => self.spawn(name, federation, handle),
+                        Ok((federation, handle)) => {
+                            adopted.push(handle.probed.clone());
+                            self.spawn(name, federation, handle);
+                        }
                         Err(error) => tracing::error!(%name, %error, "not adopted"),
                     }
                 }
                 Ok(_) => {}
                 Err(error) => tracing::error!(%name, %error, "not adopted"),
             }
+        }
+        for mut probed in adopted {
+            // Fails when it has ended, which is told, too.
+            probed.wait_for(|probed| *probed).await.ok();
         }
     }
 

@@ -211,6 +211,33 @@ async fn what_ended_without_a_daemon_is_told_by_the_next_one() {
 }
 
 #[tokio::test]
+async fn the_first_answer_of_a_new_daemon_is_its_own() {
+    let mut world = World::new().await;
+    let pair = world
+        .start_healthy("pair", &federation(&[("a", ""), ("b", "")]))
+        .await;
+    world.kill_daemon();
+    let [a, b] = ["a", "b"].map(|name| {
+        let pid = &world.record("pair")["members"][name]["supervisor"]["pid"];
+        Process::of(u32::try_from(pid.as_u64().unwrap()).unwrap())
+    });
+    // A supervisor that does not answer holds neither the daemon nor what is known of the others.
+    b.stop();
+    a.kill();
+    pair.processes["a"].assert_ends();
+    world.replace_daemon_after_end().await;
+    let view = world.client.federation("pair").await.unwrap();
+    b.go_on();
+    assert_eq!(member(&view, "a"), "ended");
+    assert_ne!(member(&view, "b"), "running");
+    assert!(view.rti_port.is_some() && view.start_ns.is_some());
+    world.client.remove("pair", true).await.unwrap();
+    for process in pair.processes.values() {
+        process.assert_ends();
+    }
+}
+
+#[tokio::test]
 async fn a_record_that_does_not_match_is_foreign_and_its_process_never_signalled() {
     let mut world = World::new().await;
     let pair = world

@@ -43,6 +43,14 @@ impl Process {
         pidfd_send_signal(&self.pidfd, Signal::KILL).unwrap();
     }
 
+    pub(crate) fn stop(&self) {
+        pidfd_send_signal(&self.pidfd, Signal::STOP).unwrap();
+    }
+
+    pub(crate) fn go_on(&self) {
+        pidfd_send_signal(&self.pidfd, Signal::CONT).unwrap();
+    }
+
     pub(crate) fn ended(&self, within: Duration) -> bool {
         let bound = Timespec::try_from(within).unwrap();
         let mut fds = [PollFd::new(&self.pidfd, PollFlags::IN)];
