@@ -28,6 +28,8 @@ use crate::process;
 
 /// How long a daemon may take to serve after it was started.
 const START_MAX: Duration = Duration::from_secs(15);
+/// How long a daemon may take to say who it is: one that was just started looks at what it adopts first.
+const PROBE_MAX: Duration = Duration::from_secs(6);
 /// How long a daemon may take to begin an answer, a removal apart.
 const ANSWER_MAX: Duration = Duration::from_secs(10);
 /// How long a daemon that owns nothing may take to end.
@@ -66,8 +68,11 @@ pub enum ClientError {
         source: io::Error,
     },
     /// The daemon does not answer; it may be stopped or overloaded.
-    #[error("the daemon does not answer")]
-    Silent,
+    #[error("the daemon{} does not answer{}", named(*.pid), way_out(*.pid))]
+    Silent {
+        /// Its process id, if the system tells.
+        pid: Option<u32>,
+    },
     /// The connection broke.
     #[error("the connection to the daemon broke")]
     Broken(#[source] hyper::Error),
@@ -91,7 +96,7 @@ impl ClientError {
             Self::Paths(_)
             | Self::NotStarted { .. }
             | Self::Unreachable { .. }
-            | Self::Silent
+            | Self::Silent { .. }
             | Self::Broken(_)
             | Self::NotUnderstood(_)
             | Self::TooLarge => None,
@@ -102,22 +107,41 @@ impl ClientError {
 impl Client {
     /// Finds the daemon that serves; absent when there is none.
     pub async fn find(paths: &Paths) -> Option<Self> {
+        Self::probe(paths).await.unwrap_or_default()
+    }
+
+    /// The same, but one that is there and does not answer is an error.
+    async fn probe(paths: &Paths) -> Result<Option<Self>, ClientError> {
         // A session with another XDG_RUNTIME_DIR may have started it: the lock tells where it listens.
-        for socket in paths.socket_in_lock().into_iter().chain([paths.socket()]) {
+        let in_lock = paths.socket_in_lock();
+        let own = Some(paths.socket()).filter(|own| in_lock.as_ref() != Some(own));
+        for socket in in_lock.into_iter().chain(own) {
             let client = Self { socket };
-            if client.info().await.is_ok() {
-                return Some(client);
+            match timeout(PROBE_MAX, client.info()).await {
+                Ok(Ok(_)) => return Ok(Some(client)),
+                Ok(Err(silent @ ClientError::Silent { .. })) => return Err(silent),
+                Ok(Err(_)) => {}
+                Err(_) => {
+                    let pid = client.listener().await;
+                    return Err(ClientError::Silent { pid });
+                }
             }
         }
-        None
+        Ok(None)
+    }
+
+    /// Who listens on the socket, as the system tells it.
+    async fn listener(&self) -> Option<u32> {
+        let stream = UnixStream::connect(&self.socket).await.ok()?;
+        listener(&stream)
     }
 
     /// Finds the daemon, or starts `EXECUTABLE daemon` and waits until it serves.
     ///
     /// # Errors
-    /// When it does not serve in time; the message has its own words.
+    /// When it does not serve in time, with its own words, or is there and does not answer.
     pub async fn find_or_start(paths: &Paths, executable: &Path) -> Result<Self, ClientError> {
-        if let Some(client) = Self::find(paths).await {
+        if let Some(client) = Self::probe(paths).await? {
             return Ok(client);
         }
         paths.create()?;
@@ -150,7 +174,7 @@ impl Client {
                 .unwrap_or_default();
             return Err(failed(String::from_utf8_lossy(new).trim().to_owned()));
         }
-        let found = Self::find(paths).await;
+        let found = Self::probe(paths).await?;
         found.ok_or_else(|| failed("it serves, but does not answer".to_owned()))
     }
 
@@ -307,6 +331,7 @@ impl Client {
         let stream = UnixStream::connect(&self.socket)
             .await
             .map_err(unreachable)?;
+        let pid = listener(&stream);
         let io = TokioIo::new(stream);
         let (mut sender, connection) = http1::handshake(io).await.map_err(ClientError::Broken)?;
         let connection = Connection(tokio::spawn(async move {
@@ -327,7 +352,7 @@ impl Client {
         } else {
             timeout(ANSWER_MAX, answer)
                 .await
-                .map_err(|_| ClientError::Silent)?
+                .map_err(|_| ClientError::Silent { pid })?
         };
         let response = response.map_err(ClientError::Broken)?;
         if response.status() == StatusCode::OK {
@@ -401,6 +426,23 @@ async fn whole(response: Response<Incoming>) -> Result<Bytes, ClientError> {
             Err(_) => Err(ClientError::TooLarge),
         },
     }
+}
+
+fn listener(stream: &UnixStream) -> Option<u32> {
+    u32::try_from(stream.peer_cred().ok()?.pid()?).ok()
+}
+
+fn named(pid: Option<u32>) -> String {
+    pid.map_or_else(String::new, |pid| format!(" (pid {pid})"))
+}
+
+fn way_out(pid: Option<u32>) -> String {
+    pid.map_or_else(String::new, |pid| {
+        format!(
+            "; if it is stopped, `kill -CONT {pid}` lets it go on; `kill -KILL {pid}` ends it, \
+             federations go on, and the next command starts another daemon"
+        )
+    })
 }
 
 fn path(name: &str, call: &str, query: &[(&str, &str)]) -> String {

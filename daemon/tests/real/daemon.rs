@@ -535,6 +535,23 @@ async fn a_stale_socket_is_replaced_and_two_daemons_never_serve() {
 }
 
 #[tokio::test]
+async fn a_daemon_that_does_not_answer_is_named_in_bounded_time() {
+    let world = World::new().await;
+    let daemon = Process::of(world.daemon.id());
+    daemon.stop();
+    let found = Client::find_or_start(&world.paths, fakes());
+    let found = tokio::time::timeout(Duration::from_secs(10), found).await;
+    daemon.go_on();
+    let said = found.expect("in time").unwrap_err().to_string();
+    let expected = format!("the daemon (pid {}) does not answer", daemon.pid);
+    assert!(said.starts_with(&expected), "{said}");
+    assert!(
+        said.contains(&format!("kill -CONT {}", daemon.pid)),
+        "{said}"
+    );
+}
+
+#[tokio::test]
 async fn a_session_with_another_runtime_directory_finds_the_same_daemon_and_federates() {
     let mut world = World::new().await;
     let pair = world
