@@ -8,6 +8,7 @@ use ictus_coord::rti::{ConnectionId, Disconnect, Rti, RtiEvent};
 use ictus_core::PhysicalTime;
 use mio::net::{TcpListener, UnixStream};
 use mio::{Events, Interest, Poll, Token};
+use rustix::io::Errno;
 use rustix::net::sockopt;
 use signal_hook::consts::{SIGINT, SIGTERM};
 
@@ -269,11 +270,21 @@ impl Server {
                     return;
                 }
                 Err(error) => {
-                    self.status
-                        .say(&format!("cannot accept a connection: {error}"));
-                    self.accepting = Accepting::Stuck;
+                    self.make_room_after(&error, now);
                     return;
                 }
+            }
+        }
+    }
+
+    /// Where no descriptor is left one stranger a round makes room: the others of the round are read first.
+    fn make_room_after(&mut self, error: &io::Error, now: PhysicalTime) {
+        match self.rti.least_needed() {
+            Some(id) if lacks_descriptors(error) => self.remove(id, now, &Disconnect::Evicted),
+            Some(_) | None => {
+                let words = format!("cannot accept a connection: {error}");
+                self.status.say(&words);
+                self.accepting = Accepting::Stuck;
             }
         }
     }
@@ -379,6 +390,14 @@ fn passes(error: &io::Error) -> bool {
         error.kind(),
         io::ErrorKind::Interrupted | io::ErrorKind::ConnectionAborted
     )
+}
+
+/// Whether the process, or the host, has as many descriptors open as it may.
+fn lacks_descriptors(error: &io::Error) -> bool {
+    let most = [Errno::MFILE, Errno::NFILE].map(Errno::raw_os_error);
+    error
+        .raw_os_error()
+        .is_some_and(|code| most.contains(&code))
 }
 
 /// The host's clock.
