@@ -19,8 +19,10 @@ use crate::supervisor::spec::PROTOCOL;
 
 mod launch;
 mod link;
+mod order;
 
 use link::{Heard, Link, Origin};
+use order::Order;
 
 /// Commands and supervisors' words waiting for the driver.
 const QUEUE_MAX: usize = 256;
@@ -78,6 +80,7 @@ pub(crate) struct Federation {
     told: broadcast::Sender<Happening>,
     /// Members of an earlier daemon that have not said everything that happened before.
     adopting: BTreeSet<MemberId>,
+    order: Order,
     /// Events up to here were told by an earlier daemon.
     told_until_ns: i64,
     /// When the last event was told.
@@ -187,6 +190,7 @@ impl Federation {
             probed,
             told,
             adopting: BTreeSet::new(),
+            order: Order::default(),
             told_until_ns: 0,
             told_last_ns: 0,
             at_ns: stamp::now_ns(),
@@ -204,7 +208,10 @@ impl Federation {
             }
             let timeout = self.agent.poll_timeout().map(|until| self.origin + until);
             tokio::select! {
-                Some(heard) = self.heard.recv() => self.handle(heard),
+                Some(heard) = self.heard.recv() => {
+                    self.order.push(heard);
+                    self.handle_all();
+                }
                 Some(command) = self.commands.recv() => self.obey(command),
                 () = sleep_until(timeout.unwrap_or(self.origin)), if timeout.is_some() => {
                     self.at_ns = stamp::now_ns();
@@ -213,8 +220,18 @@ impl Federation {
                 () = sleep_until(self.origin + PROBE_MAX), if !self.adopting.is_empty() => {
                     tracing::warn!(members = ?self.adopting, "supervisors that do not answer");
                     self.adopting.clear();
+                    self.order.expect_nobody();
+                    self.handle_all();
                 }
             }
+        }
+    }
+
+    fn handle_all(&mut self) {
+        while let Some(heard) = self.order.next() {
+            self.handle(heard);
+            // What follows from it is told with its time.
+            self.drain();
         }
     }
 
@@ -292,6 +309,7 @@ impl Federation {
     }
 
     fn link(&mut self, member: MemberId, name: &str, supervised: &Supervised, origin: Origin) {
+        self.order.expect(member);
         let (signal, signals) = mpsc::channel(SIGNALS_MAX);
         self.links.insert(member, signal);
         let link = Link {

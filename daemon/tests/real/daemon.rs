@@ -45,6 +45,9 @@ async fn a_start_tells_every_stage_and_a_stop_ends_at_the_stop_tag() {
     for stage in ["joined 2/2", "start tag", "running 2/2"] {
         assert!(stages.iter().any(|it| it == stage), "{stages:?}");
     }
+    let place = |stage: &str| stages.iter().position(|it| it == stage);
+    assert!(place("started a") < place("joined 2/2"), "{stages:?}");
+    assert!(place("started b") < place("joined 2/2"), "{stages:?}");
     let view = world.client.federation("pair").await.unwrap();
     assert_eq!(
         (view.state, member(&view, "a")),
