@@ -203,7 +203,18 @@ impl Federation {
     pub(crate) async fn run(mut self) {
         loop {
             self.drain();
-            if self.agent.outcome().is_some() {
+            if let Some(outcome) = self.agent.outcome() {
+                let undone = matches!(
+                    outcome,
+                    Outcome::Aborted
+                        | Outcome::Failed {
+                            was_healthy: false,
+                            ..
+                        }
+                );
+                if undone && let Err(error) = self.directory.undo() {
+                    tracing::warn!(%error, "not everything was undone");
+                }
                 return;
             }
             let timeout = self.agent.poll_timeout().map(|until| self.origin + until);

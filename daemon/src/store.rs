@@ -248,7 +248,8 @@ impl Directory {
     }
 
     /// Removes all but what a person may want to read after the end (logs, traces, timing files, plan, events,
-    /// exit records), or with `purge` everything; gives what is left.
+    /// exit records), or with `purge` everything; gives the directories of logs, traces and timing files that
+    /// are left, and removes those with nothing in them.
     ///
     /// # Errors
     /// When something cannot be removed.
@@ -260,11 +261,32 @@ impl Directory {
         for path in [self.request(), self.record(), self.specs()] {
             files::remove(&path).map_err(io_at(&path))?;
         }
-        let filled = |path: &PathBuf| fs::read_dir(path).is_ok_and(|mut it| it.next().is_some());
-        Ok([self.logs(), self.trace(), self.timing()]
-            .into_iter()
-            .filter(filled)
-            .collect())
+        let mut kept = Vec::new();
+        for path in [self.logs(), self.trace(), self.timing()] {
+            // Succeeds when nothing is in it.
+            if fs::remove_dir(&path).is_err() && path.exists() {
+                kept.push(path);
+            }
+        }
+        Ok(kept)
+    }
+
+    /// Removes what a start that was undone needs no more: logs, events, record and exit records stay.
+    ///
+    /// # Errors
+    /// When something cannot be removed.
+    pub(crate) fn undo(&self) -> Result<(), StoreError> {
+        for path in [
+            self.plan(),
+            self.timing_spec(),
+            self.request(),
+            self.specs(),
+            self.trace(),
+            self.timing(),
+        ] {
+            files::remove(&path).map_err(io_at(&path))?;
+        }
+        Ok(())
     }
 }
 

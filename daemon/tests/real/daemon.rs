@@ -95,6 +95,10 @@ async fn a_federate_that_exits_at_once_undoes_the_start() {
     );
     assert_eq!(failure.lines, ["no good", "really"]);
     assert!(failure.log.unwrap().is_file());
+    let left = fs::read_dir(world.directory("trio")).unwrap();
+    let mut left: Vec<_> = left.map(|it| it.unwrap().file_name()).collect();
+    left.sort();
+    assert_eq!(left, ["events.ndjson", "exit", "logs", "record.json"]);
     for pid in processes {
         assert!(
             !fs::exists(format!("/proc/{pid}")).unwrap(),
@@ -451,8 +455,11 @@ async fn down_keeps_the_logs_and_purge_keeps_nothing() {
     let _pair = world
         .start_healthy("pair", &federation(&[("a", ""), ("b", "")]))
         .await;
+    let at = |name: &str| world.directory("pair").join(name);
+    fs::write(at("timing").join("a.timing"), "0\t0").unwrap();
     let removed = world.client.remove("pair", false).await.unwrap();
-    assert_eq!(removed.kept, [world.directory("pair").join("logs")]);
+    assert_eq!(removed.kept, [at("logs"), at("timing")]);
+    assert!(!at("trace").exists(), "nothing was in it");
     assert!(world.client.federations().await.unwrap().is_empty());
     let mut logs = world
         .client
