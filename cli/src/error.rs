@@ -27,6 +27,8 @@ pub(crate) enum Kind {
     Manifest,
     /// It did not become healthy, or did not end, in time.
     Timeout,
+    /// The daemon went away; what runs goes on.
+    DaemonGone,
     /// Who reads standard output went away.
     BrokenPipe,
 }
@@ -50,10 +52,15 @@ impl CliError {
         self
     }
 
+    /// Whether only the daemon is missing.
+    pub(crate) fn daemon_gone(&self) -> bool {
+        self.kind == Kind::DaemonGone
+    }
+
     /// The process's exit code: table D6 of the deployment notes.
     pub(crate) fn code(&self) -> u8 {
         match self.kind {
-            Kind::Failed => 1,
+            Kind::Failed | Kind::DaemonGone => 1,
             Kind::Manifest => 3,
             Kind::Timeout => 6,
             Kind::BrokenPipe => 0,
@@ -103,6 +110,10 @@ impl From<ClientError> for CliError {
     fn from(error: ClientError) -> Self {
         if let ClientError::Paths(error) = error {
             return error.into();
+        }
+        if let ClientError::Broken(_) = error {
+            return Self::new(Kind::DaemonGone, "the daemon went away")
+                .hint("federations go on without it; the same command finds the next one");
         }
         let known = error
             .refusal()

@@ -6,6 +6,7 @@ use std::process::ExitCode;
 mod args;
 mod commands;
 mod error;
+mod interrupts;
 mod runs;
 mod session;
 mod ui;

@@ -8,6 +8,7 @@ use ictusd::api::{Failure, FailureKind, FederationView, Outcome, StartRequest};
 use ictusd::client::Client;
 use ictusd::paths::Paths;
 use ictusd::store;
+use serde_json::json;
 use tokio::runtime::Runtime;
 
 use crate::args::ManifestArgs;
@@ -122,7 +123,18 @@ pub(crate) fn checked(ui: &mut Ui, args: &ManifestArgs, build: bool) -> Result<C
         Progress::Described { program, federates } => {
             ui.progress("checking", &format!("{program}: {federates} federates"));
         }
-    })?;
+    });
+    let checked = match checked {
+        Ok(checked) => checked,
+        Err(problems) => {
+            // Programs that read results read these, too.
+            if ui.json() {
+                let answer = json!({ "valid": false, "problems": problems.0, "warnings": [] });
+                ui.result(&answer, String::new)?;
+            }
+            return Err(problems.into());
+        }
+    };
     for warning in &checked.warnings {
         ui.warning(&warning.to_string());
     }

@@ -216,6 +216,30 @@ fn out_error(error: io::Error) -> CliError {
     CliError::new(kind, error)
 }
 
+/// A text from elsewhere on one line: control characters escaped, cut where nobody reads on.
+pub(crate) fn one_line(text: &str) -> String {
+    const LONGEST: usize = 160;
+    let mut line = String::new();
+    for (index, part) in text
+        .lines()
+        .filter(|part| !part.trim().is_empty())
+        .enumerate()
+    {
+        line.push_str(if index == 0 { "" } else { " / " });
+        for c in part.trim().chars() {
+            if c.is_control() {
+                line.extend(c.escape_default());
+            } else {
+                line.push(c);
+            }
+        }
+    }
+    match line.char_indices().nth(LONGEST) {
+        Some((end, _)) => format!("{}...", &line[..end]),
+        None => line,
+    }
+}
+
 /// Writes nanoseconds as people read them: `1.234 s`, `12.3 ms`.
 pub(crate) fn nanoseconds(ns: i64) -> String {
     let magnitude = ns.unsigned_abs();
@@ -233,7 +257,16 @@ pub(crate) fn nanoseconds(ns: i64) -> String {
 
 #[cfg(test)]
 mod tests {
-    use super::{Table, nanoseconds};
+    use super::{Table, nanoseconds, one_line};
+
+    #[test]
+    fn what_programs_say_stays_on_one_line() {
+        assert_eq!(
+            one_line("three\nlines\n\n of\u{1b}it"),
+            "three / lines / of\\u{1b}it"
+        );
+        assert_eq!(one_line(&"x".repeat(500)).len(), 163);
+    }
 
     #[test]
     fn columns_are_aligned() {

@@ -33,6 +33,14 @@ pub struct TimingSpec {
     pub end_to_end: Vec<ChainSpec>,
 }
 
+impl TimingSpec {
+    /// Whether nothing is asked.
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        self.order.is_empty() && self.pairs.is_empty() && self.end_to_end.is_empty()
+    }
+}
+
 /// A reaction, as trace and timing files name it.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -144,7 +152,7 @@ pub fn report_runs(
     spec: &TimingSpec,
     plan: &Plan,
 ) -> Result<TimingReport, TimingError> {
-    if spec.order.is_empty() && spec.pairs.is_empty() && spec.end_to_end.is_empty() {
+    if spec.is_empty() {
         return Err(TimingError::NothingAsked);
     }
     let mut runs = Vec::new();

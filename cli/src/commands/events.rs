@@ -6,7 +6,7 @@ use ictusd::stamp;
 
 use crate::error::CliError;
 use crate::session::Session;
-use crate::ui::{Ui, nanoseconds};
+use crate::ui::{Ui, nanoseconds, one_line};
 
 /// Show what happened to federations
 #[derive(Debug, Args)]
@@ -87,7 +87,7 @@ pub(crate) fn describe(event: &Event) -> String {
             how,
             reason: Some(reason),
         } => {
-            format!("{member} ended: {how} ({reason})")
+            format!("{member} ended: {how} ({})", one_line(reason))
         }
         Event::Signalled { signal, members } => {
             format!(
@@ -113,7 +113,7 @@ pub(crate) fn describe_outcome(outcome: &Outcome) -> String {
         }
         Outcome::Failed { failure, .. } => {
             let who = failure.member.as_deref().unwrap_or("the federation");
-            format!("failed: {who}: {}", failure.what)
+            format!("failed: {who}: {}", one_line(&failure.what))
         }
         Outcome::Aborted => "undone before it was healthy".to_owned(),
     }

@@ -2,7 +2,6 @@
 
 use clap::Args;
 use ictusd::api::LogLine;
-use ictusd::client::Stream;
 
 use crate::error::CliError;
 use crate::session::Session;
@@ -31,7 +30,11 @@ impl Logs {
             let lines = client
                 .logs(&name, federates, self.follow, self.tail)
                 .await?;
-            print(ui, lines).await
+            let (mut lines, mut printer) = (lines, Printer::default());
+            while let Some(line) = lines.next().await? {
+                printer.print(ui, &line)?;
+            }
+            Ok(())
         })
     }
 
@@ -48,23 +51,27 @@ impl Logs {
     }
 }
 
-/// Prints lines until the stream ends.
-pub(crate) async fn print(ui: &mut Ui, mut lines: Stream<LogLine>) -> Result<(), CliError> {
-    // Grows with the longest name seen, so that the columns do not jump about.
-    let mut width = 0;
-    while let Some(line) = lines.next().await? {
-        width = width.max(line.member.chars().count());
-        ui.result(&line, || {
+/// Prints lines in columns.
+#[derive(Debug, Default)]
+pub(crate) struct Printer {
+    /// Grows with the longest name seen, so that the columns do not jump about.
+    width: usize,
+}
+
+impl Printer {
+    pub(crate) fn print(&mut self, ui: &mut Ui, line: &LogLine) -> Result<(), CliError> {
+        self.width = self.width.max(line.member.chars().count());
+        let width = self.width;
+        ui.result(line, || {
             let LogLine {
                 time,
                 member,
                 stream,
                 text,
-            } = &line;
+            } = line;
             let clock = time.get(11..26).unwrap_or(time);
             let mark = if stream.starts_with("err") { "!" } else { "|" };
             format!("{clock} {member:<width$} {mark} {text}")
-        })?;
+        })
     }
-    Ok(())
 }

@@ -7,7 +7,7 @@ use ictusd::api::{FederationView, MemberView, Outcome, State};
 
 use crate::error::CliError;
 use crate::session::{Session, ago};
-use crate::ui::{Table, Ui, nanoseconds};
+use crate::ui::{Table, Ui, nanoseconds, one_line};
 
 /// How often `--watch` looks.
 const PERIOD: Duration = Duration::from_secs(1);
@@ -73,7 +73,7 @@ fn show(ui: &mut Ui, views: &[FederationView]) -> Result<(), CliError> {
 fn row(member: &MemberView) -> [String; 8] {
     let number = |number: Option<u64>| number.map_or_else(|| "-".to_owned(), |it| it.to_string());
     let state = match &member.ending {
-        Some(ending) => format!("{} ({ending})", member.state),
+        Some(ending) => format!("{} ({})", member.state, one_line(ending)),
         None => member.state.clone(),
     };
     [
@@ -97,7 +97,7 @@ fn state(view: &FederationView) -> String {
         (Some(Outcome::Aborted), _) => "not started".to_owned(),
         (Some(Outcome::Failed { failure, .. }), _) => {
             let who = failure.member.as_deref().unwrap_or("federation");
-            format!("failed: {who}: {}", failure.what)
+            format!("failed: {who}: {}", one_line(&failure.what))
         }
         (None, State::Starting) => "starting".to_owned(),
         (None, State::Running) => "running".to_owned(),

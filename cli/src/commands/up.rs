@@ -6,16 +6,17 @@ use clap::Args;
 use ictusd::api::{ErrorCode, Event, Happening, Outcome};
 use ictusd::client::{Client, ClientError, Stream, is_already_running};
 use ictusd::stamp;
-use tokio::signal::unix::{Signal, SignalKind, signal};
 
 use super::events::{describe, describe_outcome};
 use super::logs;
 use crate::args::{ManifestArgs, duration};
 use crate::error::{CliError, Kind};
+use crate::interrupts::Interrupts;
 use crate::session::{Session, checked, count, request, succeed};
 use crate::ui::Ui;
 
-const GONE: &str = "the daemon went away; the federation goes on";
+/// How often `--attach` finds the daemon again before it gives up.
+const REATTACH_MAX: u32 = 5;
 
 /// How long undoing a start may take: the daemon's own bounds are shorter.
 const UNDO_MAX: Duration = Duration::from_secs(30);
@@ -45,8 +46,7 @@ struct Begun {
     client: Client,
     name: String,
     stream: Stream<Happening>,
-    /// One for the whole command: a Ctrl-C between two waits counts, too.
-    interrupts: Signal,
+    interrupts: Interrupts,
 }
 
 /// How the wait for `healthy` ended.
@@ -64,16 +64,25 @@ impl Up {
         let request = request(&checked, self.trace);
         let name = checked.plan.federation.clone();
         session.block_on(async {
-            let interrupts = signal(SignalKind::interrupt()).map_err(CliError::failed)?;
+            let interrupts = Interrupts::new()?;
             let client = session.daemon().await?;
+            let timing = !checked.timing.is_empty();
             let stream = match client.start(&name, &request).await {
                 Ok(stream) => stream,
                 Err(error) if is_already_running(&error) => {
                     ui.message(&format!("{name} is already running from the same plan"));
-                    if self.attach {
-                        ui.message("not attached: who started it may be");
+                    let said = summary(ui, &client, &name, timing).await;
+                    if !self.attach {
+                        return said;
                     }
-                    return summary(ui, &client, &name).await;
+                    let stream = client.events(Some(&name), true).await?;
+                    let begun = Begun {
+                        client,
+                        name,
+                        stream,
+                        interrupts,
+                    };
+                    return begun.attach(ui, &session, said).await;
                 }
                 Err(error) => return Err(refused(error, &name)),
             };
@@ -83,17 +92,32 @@ impl Up {
                 stream,
                 interrupts,
             };
-            self.follow(ui, begun, checked.plan.federates.len()).await
+            let of = checked.plan.federates.len();
+            let Some(begun) = self.follow(ui, begun, of).await? else {
+                return Ok(());
+            };
+            let said = summary(ui, &begun.client, &begun.name, timing).await;
+            if self.attach {
+                begun.attach(ui, &session, said).await
+            } else {
+                said
+            }
         })
     }
 
-    async fn follow(&self, ui: &mut Ui, mut begun: Begun, of: usize) -> Result<(), CliError> {
+    /// Waits until it is healthy; nothing is left to do when it has ended by itself.
+    async fn follow(
+        &self,
+        ui: &mut Ui,
+        mut begun: Begun,
+        of: usize,
+    ) -> Result<Option<Begun>, CliError> {
         let since = Instant::now();
         match begun.wait(ui, self.timeout, of).await? {
             Start::Healthy => {}
             Start::Ended(outcome) => {
                 ui.stage("ended", &describe_outcome(&outcome));
-                return succeed(&begun.name, &outcome);
+                return succeed(&begun.name, &outcome).map(|()| None);
             }
             Start::Interrupted => {
                 let message = format!("federation `{}` was not started", begun.name);
@@ -112,12 +136,7 @@ impl Up {
             "healthy",
             &format!("after {:.1} s", since.elapsed().as_secs_f64()),
         );
-        summary(ui, &begun.client, &begun.name).await?;
-        if self.attach {
-            begun.attach(ui).await
-        } else {
-            Ok(())
-        }
+        Ok(Some(begun))
     }
 }
 
@@ -173,37 +192,90 @@ impl Begun {
         Ok(())
     }
 
-    /// Shows logs until the federation ends; the first Ctrl-C stops it, the second kills it.
-    async fn attach(mut self, ui: &mut Ui) -> Result<(), CliError> {
-        let lines = self.client.logs(&self.name, &[], true, None).await?;
-        let (mut interrupts, mut printed, mut outcome) = (0, false, None);
-        let printing = logs::print(ui, lines);
-        tokio::pin!(printing);
-        while outcome.is_none() || !printed {
-            tokio::select! {
-                result = &mut printing, if !printed => {
-                    result?;
-                    printed = true;
+    /// Shows logs until the federation ends; the first Ctrl-C stops it, the second kills it. A daemon that goes away is
+    /// followed by the next. `said` tells whether anybody reads.
+    async fn attach(
+        mut self,
+        ui: &mut Ui,
+        session: &Session,
+        said: Result<(), CliError>,
+    ) -> Result<(), CliError> {
+        let mut shown = Shown::default();
+        if let Err(error) = said {
+            self.nobody_reads(&mut shown, error).await?;
+        }
+        let mut found_again = 0;
+        loop {
+            match self.show(ui, &mut shown).await {
+                Ok(outcome) => return succeed(&self.name, &outcome),
+                Err(error) if error.daemon_gone() && found_again < REATTACH_MAX => {
+                    found_again += 1;
+                    ui.message("the daemon went away; attached to the next one");
+                    self.client = session.daemon().await?;
+                    self.stream = self.client.events(Some(&self.name), true).await?;
+                    shown.again = true;
                 }
-                happening = self.stream.next(), if outcome.is_none() => match happening? {
-                    Some(Happening { event: Event::Ended { outcome: how }, .. }) => {
-                        outcome = Some(how);
+                Err(error) => return Err(error),
+            }
+        }
+    }
+
+    /// Stops the federation when standard output is closed, as if it were a terminal.
+    async fn nobody_reads(&mut self, shown: &mut Shown, error: CliError) -> Result<(), CliError> {
+        if error.kind != Kind::BrokenPipe {
+            return Err(error);
+        }
+        (shown.unread, shown.stopping) = (true, true);
+        self.client.stop(&self.name, false).await?;
+        Ok(())
+    }
+
+    async fn show(&mut self, ui: &mut Ui, shown: &mut Shown) -> Result<Outcome, CliError> {
+        let tail = shown.again.then_some(0);
+        let mut lines = self.client.logs(&self.name, &[], true, tail).await?;
+        let (mut more, mut outcome) = (true, None);
+        loop {
+            if let Some(outcome) = outcome.take_if(|_| !more || shown.unread) {
+                return Ok(outcome);
+            }
+            tokio::select! {
+                line = lines.next(), if more => match line? {
+                    Some(_) if shown.unread => {}
+                    Some(line) => {
+                        if let Err(error) = shown.printer.print(ui, &line) {
+                            self.nobody_reads(shown, error).await?;
+                        }
                     }
-                    Some(_) => {}
-                    None => return Err(CliError::failed(GONE)),
+                    None => more = false,
                 },
-                _ = self.interrupts.recv() => {
-                    interrupts += 1;
+                happening = self.stream.next(), if outcome.is_none() => match happening? {
+                    Some(Happening { event: Event::Ended { outcome: how }, .. }) => outcome = Some(how),
+                    Some(_) => {}
+                    None => return Err(CliError::new(Kind::DaemonGone, "the daemon went away")),
+                },
+                () = self.interrupts.recv() => {
+                    let kill = std::mem::replace(&mut shown.stopping, true);
+                    ui.message(if kill { "killing" } else { "stopping; again kills" });
                     // Its stream is not needed: the end is seen above.
-                    self.client.stop(&self.name, interrupts > 1).await?;
+                    self.client.stop(&self.name, kill).await?;
                 }
             }
         }
-        succeed(&self.name, &outcome.unwrap_or(Outcome::Completed))
     }
 }
 
-async fn summary(ui: &mut Ui, client: &Client, name: &str) -> Result<(), CliError> {
+/// What `--attach` has shown and done, whichever daemon serves it.
+#[derive(Debug, Default)]
+struct Shown {
+    printer: logs::Printer,
+    /// Its first lines were shown already.
+    again: bool,
+    /// Standard output is closed.
+    unread: bool,
+    stopping: bool,
+}
+
+async fn summary(ui: &mut Ui, client: &Client, name: &str, timing: bool) -> Result<(), CliError> {
     let view = client.federation(name).await?;
     ui.result(&view, || {
         let federates = count(view.federates.len(), "federate");
@@ -211,9 +283,13 @@ async fn summary(ui: &mut Ui, client: &Client, name: &str) -> Result<(), CliErro
             .rti_port
             .map(|port| format!(", RTI on 127.0.0.1:{port}"));
         let port = port.unwrap_or_default();
+        let timing = if timing {
+            format!("\n  ictus timing {name}")
+        } else {
+            String::new()
+        };
         format!(
-            "{name} runs: {federates}{port}\n  ictus ps\n  ictus logs -f {name}\n  \
-             ictus timing {name}\n  ictus down {name}"
+            "{name} runs: {federates}{port}\n  ictus ps\n  ictus logs -f {name}{timing}\n  ictus down {name}"
         )
     })
 }

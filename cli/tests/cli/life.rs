@@ -178,19 +178,7 @@ fn attached_the_first_ctrl_c_is_an_ordered_stop() {
 fn the_daemon_may_die_and_nobody_notices() {
     let environment = pair();
     let before = json(&environment.run(&["up", "pair.yaml", "-o", "json"]).ok());
-    let daemon = std::fs::read_dir("/proc")
-        .unwrap()
-        .flatten()
-        .filter_map(|entry| entry.file_name().to_str()?.parse::<u64>().ok())
-        .find(|pid| is_daemon_of(*pid, &environment.state()))
-        .unwrap();
-    assert!(
-        Command::new("kill")
-            .args(["-9", &daemon.to_string()])
-            .status()
-            .unwrap()
-            .success()
-    );
+    kill_daemon(&environment);
     let after = json(&environment.run(&["ps", "-o", "json"]).ok());
     assert_eq!(
         (&after[0]["id"], &after[0]["state"]),
@@ -199,6 +187,63 @@ fn the_daemon_may_die_and_nobody_notices() {
     assert_eq!(pids(&after[0]), pids(&before));
     let stop = environment.run(&["stop"]).ok();
     assert!(stop.err.contains("stopped at the stop tag"), "{stop}");
+}
+
+#[test]
+fn attached_the_daemon_may_die_and_ctrl_c_still_stops() {
+    let environment = pair();
+    let mut up = environment.start(&["up", "pair.yaml", "--attach"]);
+    up.wait_for("healthy");
+    kill_daemon(&environment);
+    up.wait_for("attached to the next one");
+    up.interrupt();
+    let (code, rest) = up.end();
+    assert_eq!(code, 0, "{rest}");
+    let ps = environment.run(&["ps"]).ok();
+    assert!(ps.out.contains("stopped"), "{ps}");
+}
+
+#[test]
+fn up_attaches_to_what_runs_already() {
+    let environment = pair();
+    environment.run(&["up", "pair.yaml"]).ok();
+    let mut up = environment.start(&["up", "pair.yaml", "--attach"]);
+    up.wait_for("already running");
+    up.interrupt();
+    let (code, rest) = up.end();
+    assert_eq!(code, 0, "{rest}");
+    let ps = environment.run(&["ps"]).ok();
+    assert!(ps.out.contains("stopped"), "{ps}");
+}
+
+#[test]
+fn attached_a_closed_output_is_an_ordered_stop() {
+    let environment = pair();
+    let mut up = environment
+        .command(&["up", "pair.yaml", "--attach"])
+        .stdout(std::process::Stdio::piped())
+        .stderr(std::process::Stdio::null())
+        .spawn()
+        .unwrap();
+    // Closed before anything is written to it.
+    drop(up.stdout.take());
+    let status = up.wait().unwrap();
+    assert!(status.code().is_some(), "it ends by itself: {status}");
+    let view = json(&environment.run(&["ps", "-o", "json"]).ok());
+    assert_eq!(view[0]["state"], "ended", "{view}");
+}
+
+fn kill_daemon(environment: &Environment) {
+    let daemon = std::fs::read_dir("/proc")
+        .unwrap()
+        .flatten()
+        .filter_map(|entry| entry.file_name().to_str()?.parse::<u64>().ok())
+        .find(|pid| is_daemon_of(*pid, &environment.state()))
+        .unwrap();
+    let killed = Command::new("kill")
+        .args(["-9", &daemon.to_string()])
+        .status();
+    assert!(killed.unwrap().success());
 }
 
 fn is_daemon_of(pid: u64, state: &std::path::Path) -> bool {
