@@ -190,7 +190,27 @@ fn a_panic_is_reported_with_reactor_and_tag_and_stops_the_others() {
     for words in ["tick of faulty", "490 ms", "tick 50 was the last straw"] {
         assert!(logs.contains(words), "{words:?} is missing in {logs}");
     }
-    assert!(!logs.contains("stack backtrace"), "{logs}");
+    assert!(
+        logs.contains("ictus: panicked at tests/canary/src/main.rs:"),
+        "{logs}"
+    );
+    assert!(!logs.contains("BACKTRACE"), "{logs}");
+}
+
+#[test]
+fn a_federation_that_never_waits_stops_in_order() {
+    let sandbox = Sandbox::new();
+    let package = root().join("compose/diamond");
+    let manifest = sandbox.manifest(
+        "hasty.yaml",
+        &format!(
+            "ictus: v1\nfederation: hasty\nfast: true\nprograms:\n  diamond: {{ package: {} }}\nfederates:\n  a: {{ class: A, parameters: {{ work: 0 ms }} }}\n",
+            package.display()
+        ),
+    );
+    sandbox.ok(&["up", &manifest]);
+    let said = sandbox.run(&["down", "hasty"]);
+    assert!(ictus_tests::said(&said).contains("stopped at the stop tag"));
 }
 
 #[test]

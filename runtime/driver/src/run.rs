@@ -4,7 +4,7 @@
 //! nothing stands between a message and the reaction it triggers.
 
 use crate::args::{self, Command, RunArgs, USAGE};
-use crate::assembly::Assembly;
+use crate::assembly::{Assembly, words};
 use crate::bodies::Bodies;
 use crate::class::Class;
 use crate::clock::{Clock, SystemClock};
@@ -43,6 +43,7 @@ const PROGRESS_EVERY: Duration = Duration::from_secs(1);
 /// The `main` of a program that has these classes; [`program!`](crate::program) writes the call.
 #[must_use]
 pub fn main_with(classes: &[Class]) -> ExitCode {
+    panics_are_one_line();
     let command = match args::parse(std::env::args().skip(1)) {
         Ok(command) => command,
         Err(error) => return complain(&format!("{error}\n{USAGE}"), exit::USAGE),
@@ -62,6 +63,20 @@ pub fn main_with(classes: &[Class]) -> ExitCode {
             Err(error) => complain(&error.to_string(), error.exit_code()),
         },
     }
+}
+
+/// A panic is one line; `ICTUS_BACKTRACE=1` brings the stack with it.
+fn panics_are_one_line() {
+    if std::env::var_os("ICTUS_BACKTRACE").is_some_and(|value| value == "1") {
+        return;
+    }
+    std::panic::set_hook(Box::new(|panic| {
+        let place = panic
+            .location()
+            .map_or_else(String::new, |l| format!(" at {l}"));
+        let words = words(panic.payload()).replace(['\n', '\r'], " ");
+        drop(writeln!(io::stderr(), "ictus: panicked{place}: {words}"));
+    }));
 }
 
 fn complain(message: &str, code: u8) -> ExitCode {
