@@ -111,7 +111,10 @@ impl From<ClientError> for CliError {
         if let ClientError::Paths(error) = error {
             return error.into();
         }
-        if let ClientError::Broken(_) = error {
+        if matches!(
+            error,
+            ClientError::Broken(_) | ClientError::Unreachable { .. }
+        ) {
             return Self::new(Kind::DaemonGone, "the daemon went away")
                 .hint("federations go on without it; the same command finds the next one");
         }

@@ -7,9 +7,9 @@ use std::time::Duration;
 use ictus_deploy::Checked;
 use ictusd::api::{Event, Happening, Outcome};
 use ictusd::store::Directory;
-use tokio::signal::unix::{Signal, SignalKind, signal};
 
 use crate::error::{CliError, Kind};
+use crate::interrupts::Interrupts;
 use crate::session::{Session, request, succeed};
 use crate::ui::Ui;
 
@@ -22,8 +22,7 @@ pub(crate) struct Runs<'a> {
     session: &'a Session,
     checked: &'a Checked,
     limit: Duration,
-    /// One for the whole command: a Ctrl-C between two waits counts, too.
-    interrupts: Signal,
+    interrupts: Interrupts,
     names: Vec<String>,
     /// The run that failed: its logs stay.
     failed: Option<String>,
@@ -48,7 +47,7 @@ impl<'a> Runs<'a> {
             session,
             checked,
             limit,
-            interrupts: signal(SignalKind::interrupt()).map_err(CliError::failed)?,
+            interrupts: Interrupts::new()?,
             names: Vec::new(),
             failed: None,
         })
@@ -163,7 +162,7 @@ impl<'a> Runs<'a> {
                 let seconds = self.limit.as_secs();
                 Err(CliError::new(Kind::Timeout, format!("a run did not end within {seconds} s")))
             }),
-            _ = self.interrupts.recv() => Err(CliError::failed("interrupted")),
+            () = self.interrupts.recv() => Err(CliError::failed("interrupted")),
         }
     }
 }

@@ -201,8 +201,11 @@ impl Begun {
         said: Result<(), CliError>,
     ) -> Result<(), CliError> {
         let mut shown = Shown::default();
-        if let Err(error) = said {
-            self.nobody_reads(&mut shown, error).await?;
+        match said {
+            // Found again below.
+            Err(error) if error.daemon_gone() => {}
+            Err(error) => self.nobody_reads(&mut shown, error).await?,
+            Ok(()) => {}
         }
         let mut found_again = 0;
         loop {
@@ -213,7 +216,6 @@ impl Begun {
                     ui.message("the daemon went away; attached to the next one");
                     self.client = session.daemon().await?;
                     self.stream = self.client.events(Some(&self.name), true).await?;
-                    shown.again = true;
                 }
                 Err(error) => return Err(error),
             }
@@ -242,6 +244,7 @@ impl Begun {
                 line = lines.next(), if more => match line? {
                     Some(_) if shown.unread => {}
                     Some(line) => {
+                        shown.again = true;
                         if let Err(error) = shown.printer.print(ui, &line) {
                             self.nobody_reads(shown, error).await?;
                         }

@@ -310,6 +310,31 @@ fn verify_outlives_a_daemon_that_had_nothing_to_do() {
 }
 
 #[test]
+fn a_terminated_verify_leaves_no_run() {
+    let environment = pair();
+    environment.write("long.yaml", &format!("{PAIR}timeout: 1 h\n"));
+    let mut verify = environment
+        .command(&["verify", "long.yaml"])
+        .stdout(std::process::Stdio::null())
+        .stderr(std::process::Stdio::null())
+        .spawn()
+        .unwrap();
+    // The run in one process has its directory: the command waits for it.
+    let runs = environment.state().join("federations");
+    while !runs
+        .read_dir()
+        .is_ok_and(|mut entries| entries.next().is_some())
+    {
+        assert_eq!(verify.try_wait().unwrap(), None);
+    }
+    let pid = verify.id().to_string();
+    assert!(Command::new("kill").arg(&pid).status().unwrap().success());
+    assert_eq!(verify.wait().unwrap().code(), Some(1));
+    let left = runs.read_dir().map_or(0, Iterator::count);
+    assert_eq!(left, 0, "no run is left");
+}
+
+#[test]
 fn a_run_that_fails_under_verify_leaves_its_logs() {
     let environment = pair();
     let text = PAIR.replace(
