@@ -216,6 +216,7 @@ mod tests {
                 after_ns,
                 serializer,
                 port_id: 0,
+                ..ConnectionPlan::default()
             },
         }
     }

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use ictus_coord::plan::{ClockSync, Coordination, FORMAT, FederatePlan, Plan};
+use ictus_coord::plan::{ClockPlan, ClockSync, Coordination, FORMAT, FederatePlan, Plan};
 use serde::{Deserialize, Serialize};
 
 use crate::document::{Node, SyntaxError, Value};
@@ -353,6 +353,7 @@ fn plan(manifest: &Manifest, members: &[Member<'_>], wires: Vec<Wire>) -> Plan {
             class: class.map(str::to_owned),
             program: program.map(str::to_owned),
             parameters: federation::parameters(member.federate),
+            ..FederatePlan::default()
         }
     });
     Plan {
@@ -363,10 +364,14 @@ fn plan(manifest: &Manifest, members: &[Member<'_>], wires: Vec<Wire>) -> Plan {
         fast: manifest.fast,
         keepalive: manifest.keepalive,
         max_lead_ns: manifest.max_lead.map(|span| span.0),
-        clock_sync: manifest.clock.sync,
+        clock: ClockPlan {
+            sync: manifest.clock.sync,
+            ..ClockPlan::default()
+        },
         extensions: true,
         federates: federates.collect(),
         connections: wires.into_iter().map(|wire| wire.plan).collect(),
+        ..Plan::default()
     }
 }
 

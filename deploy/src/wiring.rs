@@ -253,6 +253,7 @@ impl<'a> Wiring<'a, '_> {
                     after_ns: connection.after.map(|after| after.0),
                     serializer: serializer.clone(),
                     port_id: 0,
+                    ..ConnectionPlan::default()
                 },
             });
         }

@@ -4,7 +4,7 @@
 use std::fs;
 use std::path::PathBuf;
 
-use ictus_coord::plan::{ClockSync, Coordination, FORMAT, Plan};
+use ictus_coord::plan::Plan;
 use ictus_deploy::TimingSpec;
 use ictus_deploy::timing::{
     ChainSpec, HopSpec, OrderSpec, PairsSpec, ReactionRef, TimingError, report, report_runs,
@@ -33,17 +33,10 @@ fn hop(reactions: Vec<ReactionRef>, delay_ns: i64, sampled: bool) -> HopSpec {
 
 fn plan() -> Plan {
     Plan {
-        ictus: FORMAT.to_owned(),
         federation: "diamond".to_owned(),
-        coordination: Coordination::Centralized,
         timeout_ns: Some(400 * MS),
-        fast: false,
-        keepalive: false,
-        max_lead_ns: None,
-        clock_sync: ClockSync::Off,
         extensions: true,
-        federates: Vec::new(),
-        connections: Vec::new(),
+        ..Plan::default()
     }
 }
 

@@ -2,7 +2,7 @@ use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::time::Duration;
 
-use ictus_coord::plan::{ClockSync, Coordination, FORMAT, FederatePlan, Plan};
+use ictus_coord::plan::{FederatePlan, Plan};
 use ictus_deploy::{FederateKind, FederateRun, Settings, TimingSpec};
 use serde_json::json;
 
@@ -21,7 +21,7 @@ fn request() -> StartRequest {
         name: name.to_owned(),
         class: Some("C".to_owned()),
         program: Some("p".to_owned()),
-        parameters: serde_json::Map::new(),
+        ..FederatePlan::default()
     });
     let run = |(name, id): (&&str, u16)| FederateRun {
         id,
@@ -34,17 +34,10 @@ fn request() -> StartRequest {
         manifest: PathBuf::from("/m/federation.yaml"),
         cwd: PathBuf::from("/m"),
         plan: Plan {
-            ictus: FORMAT.to_owned(),
             federation: "pair".to_owned(),
-            coordination: Coordination::Centralized,
-            timeout_ns: None,
-            fast: false,
-            keepalive: false,
-            max_lead_ns: None,
-            clock_sync: ClockSync::Off,
             extensions: true,
             federates: plan.to_vec(),
-            connections: Vec::new(),
+            ..Plan::default()
         },
         federates: names.iter().zip(0..).map(run).collect(),
         settings: Settings::default(),

@@ -72,8 +72,9 @@ fn passed_on() -> BTreeMap<String, String> {
 
 fn rti_args(request: &StartRequest, federation_id: &str) -> Vec<String> {
     let clock = match request.settings.clock {
-        ClockSync::Off => "off",
+        ClockSync::Off | ClockSync::External => "off",
         ClockSync::Init => "init",
+        ClockSync::On => "on",
     };
     let federates = request.federates.len().to_string();
     let port = request.settings.rti_port.unwrap_or(0).to_string();

@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::time::Duration;
 
-use ictus_coord::plan::{ClockSync, Coordination, FORMAT, FederatePlan, Plan};
+use ictus_coord::plan::{FederatePlan, Plan};
 use ictus_deploy::{FederateKind, FederateRun, Settings, TimingSpec};
 use ictusd::api::{Event, Happening, Outcome, StartRequest};
 use ictusd::client::{Client, Stream};
@@ -221,7 +221,7 @@ pub(crate) fn federation(members: &[(&str, &str)]) -> StartRequest {
         name: (*name).to_owned(),
         class: Some("Fake".to_owned()),
         program: Some("fakes".to_owned()),
-        parameters: serde_json::Map::new(),
+        ..FederatePlan::default()
     };
     let run = |((name, manner), id): (&(&str, &str), u16)| FederateRun {
         id,
@@ -234,17 +234,10 @@ pub(crate) fn federation(members: &[(&str, &str)]) -> StartRequest {
         manifest: PathBuf::from("/m/federation.yaml"),
         cwd: PathBuf::from("/"),
         plan: Plan {
-            ictus: FORMAT.to_owned(),
             federation: "fake".to_owned(),
-            coordination: Coordination::Centralized,
-            timeout_ns: None,
-            fast: false,
-            keepalive: false,
-            max_lead_ns: None,
-            clock_sync: ClockSync::Off,
             extensions: true,
             federates: members.iter().map(plan).collect(),
-            connections: Vec::new(),
+            ..Plan::default()
         },
         federates: members.iter().zip(0..).map(run).collect(),
         settings: Settings {

@@ -29,7 +29,7 @@ impl FederateExecutor for Nothing {
 
 fn joining(clock_sync: &str) -> Federate {
     let plan = format!(
-        r#"{{"ictus": "v1", "federation": "f", "coordination": "centralized", "clock_sync": "{clock_sync}",
+        r#"{{"ictus": "v1", "federation": "f", "coordination": "centralized", "clock": {{"sync": "{clock_sync}"}},
             "federates": [{{"name": "a", "class": "A", "program": "p"}}], "connections": []}}"#
     );
     let plan: Plan = serde_json::from_str(&plan).unwrap();

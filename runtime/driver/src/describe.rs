@@ -8,7 +8,7 @@ use ictus_coord::describe::{
     ClassDescription, InstanceDescriptions, InstanceRequest, PortDescription, ProgramDescription,
     ReactionDescription,
 };
-use ictus_coord::plan::{ClockSync, Coordination, FORMAT, FederatePlan, Plan};
+use ictus_coord::plan::{FORMAT, FederatePlan, Plan};
 use ictus_core::{PortKind, Program};
 use serde::Serialize;
 use std::io::Write;
@@ -126,22 +126,16 @@ pub fn instance(classes: &[Class], request: InstanceRequest) -> ClassDescription
 
 fn build(classes: &[Class], request: InstanceRequest) -> Result<ClassDescription, AssemblyError> {
     let plan = Plan {
-        ictus: FORMAT.to_owned(),
         federation: request.name.clone(),
-        coordination: Coordination::Centralized,
-        timeout_ns: None,
         fast: true,
-        keepalive: false,
-        max_lead_ns: None,
-        clock_sync: ClockSync::Off,
         extensions: false,
         federates: vec![FederatePlan {
             name: request.name,
             class: Some(request.class),
-            program: None,
             parameters: request.parameters,
+            ..FederatePlan::default()
         }],
-        connections: Vec::new(),
+        ..Plan::default()
     };
     let mut assembler = Assembler::new(&plan, Arc::new(SystemClock::new()));
     let reactor = assembler.instantiate(0, classes)?;

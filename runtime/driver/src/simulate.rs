@@ -64,9 +64,7 @@ use crate::observe::{Memory, Observer};
 use crate::reactor::Reactions;
 use ictus_coord::describe::InstanceRequest;
 use ictus_coord::federate::{Federate, FederateConfig, Outcome, Poll};
-use ictus_coord::plan::{
-    ClockSync, ConnectionPlan, Coordination, Endpoint, FORMAT, FederatePlan, Plan,
-};
+use ictus_coord::plan::{ConnectionPlan, Endpoint, FederatePlan, Plan};
 use ictus_coord::{FederateExecutor, PayloadError};
 use ictus_core::{
     ActionId, Duration, Effects, Executor, InputId, NodeId, OutputId, PhysicalTime, SlotId, Tag,
@@ -172,17 +170,9 @@ impl Federation {
     pub fn new() -> Self {
         Self {
             plan: Plan {
-                ictus: FORMAT.to_owned(),
                 federation: "simulated".to_owned(),
-                coordination: Coordination::Centralized,
-                timeout_ns: None,
-                fast: false,
-                keepalive: false,
-                max_lead_ns: None,
-                clock_sync: ClockSync::Off,
                 extensions: true,
-                federates: Vec::new(),
-                connections: Vec::new(),
+                ..Plan::default()
             },
             classes: BTreeMap::new(),
             error: None,
@@ -203,8 +193,8 @@ impl Federation {
         self.plan.federates.push(FederatePlan {
             name: name.to_owned(),
             class: Some(class.name().to_owned()),
-            program: None,
             parameters,
+            ..FederatePlan::default()
         });
         self
     }
@@ -223,6 +213,7 @@ impl Federation {
                     to,
                     after_ns: after.map(Duration::as_nanos),
                     port_id: u16::try_from(ports).unwrap_or(u16::MAX),
+                    ..ConnectionPlan::default()
                 });
             }
             Err(error) => {

@@ -70,7 +70,7 @@ fn swarm(plan: &Plan, rng: &mut Rng) -> Swarm {
     };
     swarm.mode.fast = plan.fast;
     swarm.mode.parallel = false;
-    swarm.mode.clock_sync = plan.clock_sync == ClockSync::Init;
+    swarm.mode.clock_sync = plan.clock.sync == ClockSync::Init;
     swarm.mode.extensions = plan.extensions;
     swarm.mode.legacy_sources = false;
     swarm.mode.calm = false;

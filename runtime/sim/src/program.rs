@@ -3,9 +3,7 @@
 mod build;
 mod generate;
 
-use ictus_coord::plan::{
-    ClockSync, ConnectionPlan, Coordination, Endpoint, FORMAT, FederatePlan, Plan,
-};
+use ictus_coord::plan::{ClockPlan, ClockSync, ConnectionPlan, Endpoint, FederatePlan, Plan};
 use ictus_core::{ActionKind, Delay, Duration};
 use std::fmt;
 
@@ -121,7 +119,7 @@ impl Federation {
             name: f.reactors[0].path.clone(),
             class: Some("Synthetic".to_owned()),
             program: Some("sim".to_owned()),
-            parameters: serde_json::Map::new(),
+            ..FederatePlan::default()
         });
         let connections = self.links.iter().map(|link| ConnectionPlan {
             from: Endpoint {
@@ -141,23 +139,25 @@ impl Federation {
             },
             serializer: "native".to_owned(),
             port_id: small(link.to.1),
+            ..ConnectionPlan::default()
         });
         Plan {
-            ictus: FORMAT.to_owned(),
             federation: "simulated".to_owned(),
-            coordination: Coordination::Centralized,
             timeout_ns: self.timeout.map(Duration::as_nanos),
             fast: self.fast,
-            keepalive: false,
             max_lead_ns: self.max_lead.map(Duration::as_nanos),
-            clock_sync: if self.clock_sync {
-                ClockSync::Init
-            } else {
-                ClockSync::Off
+            clock: ClockPlan {
+                sync: if self.clock_sync {
+                    ClockSync::Init
+                } else {
+                    ClockSync::Off
+                },
+                ..ClockPlan::default()
             },
             extensions: self.extensions,
             federates: federates.collect(),
             connections: connections.collect(),
+            ..Plan::default()
         }
     }
 

@@ -16,9 +16,6 @@ const ADVANCE_INTERVAL: Duration = Duration::from_millis(10);
 /// Promises that nobody is known to wait for are at least this far apart: in a zero-delay cycle each is answered.
 const PROMISE_SPACING: Duration = Duration::from_millis(1);
 
-/// Clock exchanges while joining; both sides must count the same. Source: section 3.5 of the wire document.
-const CLOCK_EXCHANGES: u32 = 10;
-
 /// What a federate knows of its place in the federation.
 #[derive(Clone, Debug, Default)]
 pub struct LinkConfig {
@@ -80,7 +77,8 @@ impl LinkConfig {
             inputs: inputs.iter().map(input).collect(),
             outputs: outputs.iter().map(output).collect(),
             in_cycle: topology.in_zero_delay_cycle(me),
-            clock_exchanges: (plan.clock_sync == ClockSync::Init).then_some(CLOCK_EXCHANGES),
+            clock_exchanges: matches!(plan.clock.sync, ClockSync::Init | ClockSync::On)
+                .then_some(plan.clock.trials),
             extensions: plan.extensions,
             max_lead: plan.max_lead_ns.map(Duration::from_nanos),
             fast: plan.fast,

@@ -2,9 +2,7 @@
 
 use ictus::value::digest_of;
 use ictus::{Assembly, AssemblyError, Class, Clock, Fault, Observation, Value};
-use ictus_coord::plan::{
-    ClockSync, ConnectionPlan, Coordination, Endpoint, FORMAT, FederatePlan, Plan,
-};
+use ictus_coord::plan::{ConnectionPlan, Endpoint, FederatePlan, Plan};
 use ictus_core::{
     Duration, Effects, Executor, LogicalTime, NodeId, PhysicalTime, Progress, Tag, Timeline,
 };
@@ -55,17 +53,10 @@ impl World {
         clock.set(Duration::ZERO);
         Self {
             plan: Plan {
-                ictus: FORMAT.to_owned(),
                 federation: "test".to_owned(),
-                coordination: Coordination::Centralized,
-                timeout_ns: None,
                 fast: true,
-                keepalive: false,
-                max_lead_ns: None,
-                clock_sync: ClockSync::Off,
                 extensions: true,
-                federates: Vec::new(),
-                connections: Vec::new(),
+                ..Plan::default()
             },
             classes: classes.to_vec(),
             clock,
@@ -82,8 +73,8 @@ impl World {
         self.plan.federates.push(FederatePlan {
             name: name.to_owned(),
             class: Some(class.to_owned()),
-            program: None,
             parameters: serde_json::from_str(parameters).unwrap(),
+            ..FederatePlan::default()
         });
         self
     }
@@ -94,8 +85,8 @@ impl World {
             from: self.endpoint(from),
             to: self.endpoint(to),
             after_ns: after.map(Duration::as_nanos),
-            serializer: "native".to_owned(),
             port_id,
+            ..ConnectionPlan::default()
         });
         self
     }
