@@ -36,6 +36,7 @@ use std::collections::VecDeque;
 use ictus_core::{Duration, PhysicalTime, Tag};
 
 use crate::mutants::Mutants;
+use crate::plan::Wire;
 use crate::topology::{FederateId, Topology};
 use crate::wire::{MAX_PAYLOAD, NeighborStructure, RejectReason, ToFederate};
 
@@ -63,6 +64,8 @@ pub struct RtiConfig {
     pub federates: u16,
     /// Clock exchanges with each federate that asks for them while it joins; 0: none.
     pub clock_exchanges: u32,
+    /// The layout of ADDRESS_QUERY.
+    pub wire: Wire,
     /// Whether DNETs are sent.
     pub dnet: bool,
     /// The start time is rounded up to a multiple of this.
@@ -99,6 +102,7 @@ impl RtiConfig {
             federation: federation.to_owned(),
             federates,
             clock_exchanges: 0,
+            wire: Wire::V0_12,
             dnet: true,
             start_multiple: None,
             handshake_timeout: Duration::from_secs(30),

@@ -2,12 +2,12 @@
 //!
 //! There is no framing: a message is one type byte and a body whose length follows from the type or from a length
 //! field. Integers are little endian; a tag is an `i64` time and a `u32` microstep; a delay is an `i64`, where a
-//! negative one is no delay at all and 0 is one microstep. Times FOREVER and NEVER are made whole when they are
+//! negative one is no delay at all and 0 is one microstep. Two layouts differ between LF's releases: [`Wire`]. Times FOREVER and NEVER are made whole when they are
 //! decoded: (FOREVER, any microstep) is [`Tag::FOREVER`], likewise NEVER.
 //!
 //! | Id | Message | Direction | Size | Body |
 //! | --- | --- | --- | --- | --- |
-//! | 0 | [`ToFederate::Reject`] | R→F | 2 | reason u8 |
+//! | 0 | [`ToFederate::Reject`], [`FromPeer::Reject`] | R→F, P→P | 2 | reason u8 |
 //! | 1 | [`ToRti::FederateIds`] | F→R | 4+n | federate u16, n u8, federation id |
 //! | 2 | [`ToRti::Timestamp`], [`ToFederate::Timestamp`] | both | 9 | physical time; the start time |
 //! | 4 | [`ToRti::Resign`] | F→R | 1 | |
@@ -19,13 +19,16 @@
 //! | 10 | `StopRequest` | both | 13 | tag |
 //! | 11 | [`ToRti::StopRequestReply`] | F→R | 13 | tag |
 //! | 12 | [`ToFederate::StopGranted`] | R→F | 13 | tag |
-//! | 13 | [`ToRti::AddressQuery`] | F→R | 3 | federate u16 |
+//! | 13 | [`ToRti::AddressQuery`] | F→R | 3 | federate u16; LF 0.13: 4, whether it is transient u8 follows |
 //! | 14 | [`ToFederate::AddressQueryReply`] | R→F | 9 | port i32 (-1: unknown), IPv4 in network order |
 //! | 15 | [`ToRti::AddressAdvertisement`] | F→R | 5 | port i32 |
+//! | 16 | [`ToPeer::Hello`] | P→P | 4+n | federate u16, n u8, federation id; LF 0.13: 5+n, transient u8 before n |
+//! | 17 | [`ToPeer::Message`] | P→P | 9+n | port u16, destination u16, n u32, payload |
+//! | 18 | [`ToPeer::TaggedMessage`] | P→P | 21+n | as 5 |
 //! | 19 | [`ToFederate::ClockSyncT1`] | R→F | 9 | physical time |
 //! | 20 | [`ToRti::ClockSyncT3`] | F→R | 3 | federate u16 |
 //! | 21 | [`ToFederate::ClockSyncT4`] | R→F | 9 | physical time |
-//! | 23 | `PortAbsent` | both | 17 | port u16, destination u16, tag |
+//! | 23 | `PortAbsent` | both, P→P | 17 | port u16, destination u16, tag |
 //! | 24 | [`ToRti::NeighborStructure`] | F→R | 9+10u+2d | u i32, d i32, u × (federate u16, delay), d × federate u16 |
 //! | 25 | `Failed` | both | 1 | |
 //! | 26 | [`ToFederate::DownstreamNextEventTag`] | R→F | 13 | tag |
@@ -36,7 +39,7 @@
 //! | 201 | [`ToFederate::DownstreamConfirmed`] | R→F | 13 | tag |
 //! | 202 | [`ToFederate::FederateLost`] | R→F | 15 | federate u16, tag |
 //! | 254 | [`ToRti::UdpPort`] | F→R | 3 | port u16: 65535 no clock sync, 0 at start only, else continuous |
-//! | 255 | [`ToFederate::Ack`] | R→F | 1 | |
+//! | 255 | [`ToFederate::Ack`], [`FromPeer::Ack`] | R→F, P→P | 1 | |
 //!
 //! 200 to 202 are ours and pass only between our own peers. A federate sends CAPABILITIES once, right after UDP_PORT
 //! and only when its plan says that the RTI is ours; the RTI sends 201 only to a federate with
@@ -46,9 +49,13 @@
 
 use ictus_core::{Delay, PhysicalTime, Tag};
 
+use crate::plan::Wire;
+
 mod codec;
+mod peer;
 
 use codec::{Reader, Writer};
+pub use peer::{FromPeer, PeerMessage, ToPeer, encode_peer_message};
 
 /// The largest payload that [`ToRti::decode`] and [`ToFederate::decode`] accept, in bytes (64 MiB).
 pub const MAX_PAYLOAD: u32 = 64 << 20;
@@ -87,6 +94,8 @@ pub mod kind {
     pub const ADDRESS_ADVERTISEMENT: u8 = 15;
     /// P2P_SENDING_FED_ID, between federates: at the RTI it means that the peer has the wrong server.
     pub const P2P_FEDERATE_ID: u8 = 16;
+    /// P2P_MESSAGE, between federates: untagged, on a physical connection.
+    pub const P2P_MESSAGE: u8 = 17;
     /// P2P_TAGGED_MESSAGE, between federates: at the RTI it means that the peer has the wrong server.
     pub const P2P_TAGGED_MESSAGE: u8 = 18;
     /// CLOCK_SYNC_T1, RTI to federate.
@@ -232,6 +241,8 @@ pub enum ToRti<'a> {
     AddressQuery {
         /// The federate asked about.
         federate: u16,
+        /// Whether it is transient, where the layout says so (LF 0.13).
+        transient: Option<bool>,
     },
     /// Says where this federate listens for peers.
     AddressAdvertisement {
@@ -419,7 +430,7 @@ impl<'a> ToRti<'a> {
                     .short_bytes(federation);
             }
             Self::Timestamp(time) => w.time(kind::TIMESTAMP, *time),
-            Self::TaggedMessage(message) => w.message(message),
+            Self::TaggedMessage(message) => w.message(kind::TAGGED_MESSAGE, message),
             Self::PortAbsent(absent) => w.absent(absent),
             Self::NextEventTag(tag) => w.tag_only(kind::NEXT_EVENT_TAG, *tag),
             Self::LatestTagConfirmed(tag) => w.tag_only(kind::LATEST_TAG_CONFIRMED, *tag),
@@ -438,8 +449,14 @@ impl<'a> ToRti<'a> {
             Self::ClockSyncT3 { federate } => {
                 w.u8(kind::CLOCK_SYNC_T3).u16(*federate);
             }
-            Self::AddressQuery { federate } => {
+            Self::AddressQuery {
+                federate,
+                transient,
+            } => {
                 w.u8(kind::ADDRESS_QUERY).u16(*federate);
+                if let Some(transient) = transient {
+                    w.u8(u8::from(*transient));
+                }
             }
             Self::AddressAdvertisement { port } => {
                 w.u8(kind::ADDRESS_ADVERTISEMENT).i32(*port);
@@ -456,7 +473,8 @@ impl<'a> ToRti<'a> {
         }
     }
 
-    /// Decodes the message at the start of `bytes` and says how many bytes it takes; `None` when more are needed.
+    /// Decodes the message at the start of `bytes`, in LF 0.12's layout, and says how many bytes it takes; `None` when
+    /// more are needed.
     ///
     /// Laws `decode_never_panics` and `every_prefix_is_incomplete`. Nothing but the neighbour lists is copied.
     ///
@@ -464,16 +482,17 @@ impl<'a> ToRti<'a> {
     ///
     /// When the type is unknown or a length is out of range; the stream cannot be read any further.
     pub fn decode(bytes: &'a [u8]) -> Result<Option<(Self, usize)>, DecodeError> {
-        Self::decode_limited(bytes, MAX_PAYLOAD)
+        Self::decode_limited(bytes, Wire::V0_12, MAX_PAYLOAD)
     }
 
-    /// As [`ToRti::decode`], with a limit of `max_payload` bytes for a payload.
+    /// As [`ToRti::decode`], in the layout of `wire` and with a limit of `max_payload` bytes for a payload.
     ///
     /// # Errors
     ///
     /// As [`ToRti::decode`].
     pub fn decode_limited(
         bytes: &'a [u8],
+        wire: Wire,
         max_payload: u32,
     ) -> Result<Option<(Self, usize)>, DecodeError> {
         let mut r = Reader::new(bytes);
@@ -483,6 +502,7 @@ impl<'a> ToRti<'a> {
             kind::NEXT_EVENT_TAG => r.tag().map(Self::NextEventTag),
             kind::LATEST_TAG_CONFIRMED => r.tag().map(Self::LatestTagConfirmed),
             kind::PORT_ABSENT => r.absent().map(Self::PortAbsent),
+            kind::ADDRESS_QUERY => r.address_query(wire),
             kind::NEIGHBOR_STRUCTURE => r.neighbors()?.map(Self::NeighborStructure),
             _ => match Self::decode_rare(kind, &mut r) {
                 Some(message) => message,
@@ -509,7 +529,6 @@ impl<'a> ToRti<'a> {
             kind::STOP_REQUEST_REPLY => r.tag().map(Self::StopRequestReply),
             kind::UDP_PORT => r.u16().map(Self::UdpPort),
             kind::CLOCK_SYNC_T3 => r.u16().map(|federate| Self::ClockSyncT3 { federate }),
-            kind::ADDRESS_QUERY => r.u16().map(|federate| Self::AddressQuery { federate }),
             kind::ADDRESS_ADVERTISEMENT => r.i32().map(|port| Self::AddressAdvertisement { port }),
             kind::FEDERATE_NONCE => r.u16().and_then(|federate| {
                 let nonce = r.array()?;
@@ -536,7 +555,7 @@ impl<'a> ToFederate<'a> {
                 w.u8(kind::REJECT).u8(reason.code());
             }
             Self::Timestamp(time) => w.time(kind::TIMESTAMP, *time),
-            Self::TaggedMessage(message) => w.message(message),
+            Self::TaggedMessage(message) => w.message(kind::TAGGED_MESSAGE, message),
             Self::PortAbsent(absent) => w.absent(absent),
             Self::TagAdvanceGrant(tag) => w.tag_only(kind::TAG_ADVANCE_GRANT, *tag),
             Self::ProvisionalTagAdvanceGrant(tag) => {

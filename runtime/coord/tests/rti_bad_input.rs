@@ -62,7 +62,10 @@ fn message() -> impl Strategy<Value = Vec<u8>> {
                 10 => ToRti::Resign,
                 11 => ToRti::ClockSyncT3 { federate },
                 12 => ToRti::Capabilities(3),
-                _ => ToRti::AddressQuery { federate },
+                _ => ToRti::AddressQuery {
+                    federate,
+                    transient: None,
+                },
             };
             message.encode(&mut bytes);
             bytes

@@ -272,6 +272,7 @@ impl World {
             }
             ["ADDRESS_QUERY", id] => ToRti::AddressQuery {
                 federate: id.parse().unwrap(),
+                transient: None,
             }
             .encode(out),
             ["MSG", to, at] => {

@@ -3,6 +3,7 @@
 use std::ffi::OsString;
 use std::net::{IpAddr, Ipv4Addr};
 
+use ictus_coord::plan::Wire;
 use ictus_coord::rti::RtiConfig;
 use ictus_core::Duration;
 
@@ -39,6 +40,7 @@ Coordinates one federation; takes the options of Lingua Franca's RTI.
                                 themselves take no longer ones than 64M
       --max-output SIZE         the most that may wait for one federate (default 256M); more ends the
                                 federation
+      --wire 0.12|0.13          the layout of address queries: LF's to 0.12 (default), or from 0.13 on
       --status-fd FD            write one JSON object a line to this inherited descriptor
   -v, --version
   -h, --help";
@@ -186,6 +188,7 @@ impl Parser {
                 let size = self.size(option, LARGEST_OUTPUT)?;
                 self.options.config.max_output = usize::try_from(size).unwrap_or(usize::MAX);
             }
+            "--wire" => self.options.config.wire = self.wire(option)?,
             "--status-fd" => {
                 self.options.status_fd = Some(self.number(option, "a descriptor's number")?);
             }
@@ -294,6 +297,15 @@ impl Parser {
         Ok(())
     }
 
+    fn wire(&mut self, option: &str) -> Result<Wire, UsageError> {
+        let value = self.value(option)?;
+        match value.as_str() {
+            "0.12" => Ok(Wire::V0_12),
+            "0.13" => Ok(Wire::V0_13),
+            _ => invalid(option, "0.12 or 0.13", value),
+        }
+    }
+
     fn multiple(&mut self, option: &str) -> Result<Duration, UsageError> {
         let value: i64 = self.number(option, "a number and a unit")?;
         let unit = self.value(option)?;
@@ -398,6 +410,16 @@ mod tests {
         assert_eq!(options.config.federates, 2);
         assert_eq!(options.config.clock_exchanges, 4);
         assert!(!options.config.dnet);
+    }
+
+    #[test]
+    fn the_layout_is_chosen() {
+        let wire = |line: &str| parse(line).unwrap().config.wire;
+        assert_eq!(wire("-n 1"), Wire::V0_12);
+        assert_eq!(wire("-n 1 --wire 0.13"), Wire::V0_13);
+        assert_eq!(wire("-n 1 --wire 0.12"), Wire::V0_12);
+        let error = parse("-n 1 --wire 0.11").unwrap_err().to_string();
+        assert_eq!(error, "`--wire` takes 0.12 or 0.13, not `0.11`");
     }
 
     #[test]

@@ -97,7 +97,7 @@ impl Rti {
     }
 
     fn receive_control(&mut self, from: FederateId, bytes: &[u8]) -> usize {
-        match ToRti::decode_limited(bytes, self.config.max_payload) {
+        match ToRti::decode_limited(bytes, self.config.wire, self.config.max_payload) {
             Ok(None) => 0,
             Ok(Some((message, consumed))) => {
                 self.handle_running(from, &message, &bytes[..consumed]);
@@ -128,7 +128,7 @@ impl Rti {
             ToRti::AddressAdvertisement { port } => {
                 self.members[from.index()].listener = Some(*port);
             }
-            ToRti::AddressQuery { federate } => self.answer_query(from, *federate),
+            ToRti::AddressQuery { federate, .. } => self.answer_query(from, *federate),
             ToRti::TaggedMessage(_)
             | ToRti::FederateIds { .. }
             | ToRti::Timestamp(_)

@@ -91,7 +91,7 @@ impl Rti {
 
     /// One message of a federate that has not got the start time.
     pub(super) fn receive_joining(&mut self, federate: FederateId, bytes: &[u8]) -> usize {
-        match ToRti::decode_limited(bytes, self.config.max_payload) {
+        match ToRti::decode_limited(bytes, self.config.wire, self.config.max_payload) {
             Ok(None) => 0,
             Ok(Some((message, consumed))) => {
                 self.handle_joining(federate, message);
@@ -124,7 +124,12 @@ impl Rti {
             (_, ToRti::AddressAdvertisement { port }) => {
                 self.members[federate.index()].listener = Some(port);
             }
-            (_, ToRti::AddressQuery { federate: asked }) => self.answer_query(federate, asked),
+            (
+                _,
+                ToRti::AddressQuery {
+                    federate: asked, ..
+                },
+            ) => self.answer_query(federate, asked),
             (_, ToRti::Failed) => self.fail(federate, "it reported a failure".to_owned()),
             (_, ToRti::Resign) => self.fail(federate, "it resigned before the start".to_owned()),
             (_, message) => {

@@ -2,7 +2,8 @@
 
 use ictus_core::{Delay, Duration, LogicalTime, PhysicalTime, Tag};
 
-use super::{DecodeError, NeighborStructure, PortAbsent, TaggedMessage, kind};
+use super::{DecodeError, NeighborStructure, PeerMessage, PortAbsent, TaggedMessage, ToRti, kind};
+use crate::plan::Wire;
 
 /// Takes scalars from the front of a slice; every method gives `None` when bytes are missing.
 pub(super) struct Reader<'a> {
@@ -83,12 +84,7 @@ impl<'a> Reader<'a> {
         let Some((port, federate, length)) = self.message_head() else {
             return Ok(None);
         };
-        if length > max_payload {
-            return Err(DecodeError::PayloadTooLong {
-                length,
-                limit: max_payload,
-            });
-        }
+        within(length, max_payload)?;
         Ok(self
             .message_rest(length)
             .map(|(tag, payload)| TaggedMessage {
@@ -97,6 +93,40 @@ impl<'a> Reader<'a> {
                 tag,
                 payload,
             }))
+    }
+
+    /// The body of an untagged message.
+    pub(super) fn peer_message(
+        &mut self,
+        max_payload: u32,
+    ) -> Result<Option<PeerMessage<'a>>, DecodeError> {
+        let Some((port, federate, length)) = self.message_head() else {
+            return Ok(None);
+        };
+        within(length, max_payload)?;
+        let payload = usize::try_from(length).ok().and_then(|n| self.slice(n));
+        Ok(payload.map(|payload| PeerMessage {
+            port,
+            federate,
+            payload,
+        }))
+    }
+
+    pub(super) fn address_query(&mut self, wire: Wire) -> Option<ToRti<'a>> {
+        let federate = self.u16()?;
+        let transient = match wire {
+            Wire::V0_12 => None,
+            Wire::V0_13 => Some(self.flag()?),
+        };
+        Some(ToRti::AddressQuery {
+            federate,
+            transient,
+        })
+    }
+
+    /// Any byte but 0 is true, as in C.
+    pub(super) fn flag(&mut self) -> Option<bool> {
+        self.u8().map(|byte| byte != 0)
     }
 
     fn message_head(&mut self) -> Option<(u16, u16, u32)> {
@@ -139,6 +169,13 @@ impl<'a> Reader<'a> {
             downstream,
         })
     }
+}
+
+fn within(length: u32, limit: u32) -> Result<(), DecodeError> {
+    if length > limit {
+        return Err(DecodeError::PayloadTooLong { length, limit });
+    }
+    Ok(())
 }
 
 fn neighbor_count(count: i32) -> Result<usize, DecodeError> {
@@ -199,15 +236,25 @@ impl Writer<'_> {
     }
 
     /// The payload's length is a u32 on the wire.
-    pub(super) fn message(&mut self, message: &TaggedMessage<'_>) {
+    pub(super) fn message(&mut self, kind: u8, message: &TaggedMessage<'_>) {
         let length = u32::try_from(message.payload.len()).expect("a payload is under 4 GiB");
-        let mut head = [kind::TAGGED_MESSAGE; 21];
+        let mut head = [kind; 21];
         head[1..3].copy_from_slice(&message.port.to_le_bytes());
         head[3..5].copy_from_slice(&message.federate.to_le_bytes());
         head[5..9].copy_from_slice(&length.to_le_bytes());
         head[9..17].copy_from_slice(&message.tag.time.as_nanos().to_le_bytes());
         head[17..].copy_from_slice(&message.tag.microstep.to_le_bytes());
         self.bytes(&head).bytes(message.payload);
+    }
+
+    /// The payload's length is a u32 on the wire.
+    pub(super) fn peer_message(&mut self, message: &PeerMessage<'_>) {
+        let length = u32::try_from(message.payload.len()).expect("a payload is under 4 GiB");
+        self.u8(kind::P2P_MESSAGE)
+            .u16(message.port)
+            .u16(message.federate)
+            .u32(length)
+            .bytes(message.payload);
     }
 
     pub(super) fn absent(&mut self, absent: &PortAbsent) {

@@ -70,7 +70,10 @@ fn to_rti_owned() -> impl Strategy<Value = ToRti<'static>> {
         neighbors().prop_map(ToRti::NeighborStructure),
         any::<u16>().prop_map(ToRti::UdpPort),
         any::<u16>().prop_map(|federate| ToRti::ClockSyncT3 { federate }),
-        any::<u16>().prop_map(|federate| ToRti::AddressQuery { federate }),
+        any::<u16>().prop_map(|federate| ToRti::AddressQuery {
+            federate,
+            transient: None,
+        }),
         any::<i32>().prop_map(|port| ToRti::AddressAdvertisement { port }),
         any::<(u16, [u8; 8])>()
             .prop_map(|(federate, nonce)| ToRti::FederateNonce { federate, nonce }),
@@ -212,7 +215,7 @@ fn an_impossible_neighbour_count_is_refused() {
 
 #[test]
 fn messages_of_the_other_direction_are_unknown() {
-    for byte in [7, 8, 12, 16, 18, 26, 3, 27] {
+    for byte in [7, 8, 12, 16, 17, 18, 26, 3, 27] {
         assert_eq!(ToRti::decode(&[byte]), Err(DecodeError::UnknownType(byte)));
     }
     for byte in [1, 4, 6, 9, 11, 24, 200, 254] {
