@@ -109,6 +109,14 @@ impl Agent {
         match status {
             // The RTI says these, for foreign federates as well.
             FederateStatus::Joined { .. } | FederateStatus::Start { .. } => {}
+            FederateStatus::Measures { .. }
+            | FederateStatus::Upstream { .. }
+            | FederateStatus::Downstream { .. }
+            | FederateStatus::Clock { .. }
+            | FederateStatus::StpViolation { .. }
+            | FederateStatus::FallingBehind { .. }
+            | FederateStatus::CaughtUp { .. }
+            | FederateStatus::ClockStep { .. } => {}
             FederateStatus::Running { .. } => {
                 member.running = true;
                 let federate = member.name.clone();

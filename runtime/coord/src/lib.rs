@@ -2,6 +2,7 @@
 
 pub mod describe;
 pub mod federate;
+pub mod measure;
 #[doc(hidden)]
 pub mod mutants;
 mod payload;

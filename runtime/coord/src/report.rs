@@ -1,7 +1,12 @@
 //! What a running federate or RTI says of itself, one JSON object a line on the inherited descriptor given by
 //! `--status-fd`, and the exit codes both use. Writing never blocks: a full pipe drops `progress` lines only.
 
+use crate::measure::{Downstream, Own, Upstream};
 use serde::{Deserialize, Serialize};
+
+mod clock;
+
+pub use clock::{ClockSource, ClockStatus};
 
 /// Exit codes of federate programs and of the RTI.
 pub mod exit {
@@ -58,6 +63,70 @@ pub enum FederateStatus {
         received: u64,
         /// Deadlines missed.
         deadlines_missed: u64,
+    },
+    /// What the federate measured of itself; with `Progress`.
+    Measures {
+        /// The federate's name.
+        federate: String,
+        /// Cumulative; histograms that did not fit are left out here and come in a line of their own.
+        own: Own,
+    },
+    /// What the federate measured of messages from one upstream peer; with `Progress`.
+    Upstream {
+        /// The federate's name.
+        federate: String,
+        /// The peer's federate id.
+        upstream: u16,
+        /// As in `Measures`.
+        measures: Upstream,
+    },
+    /// What the federate measured of messages to one downstream peer; with `Progress`.
+    Downstream {
+        /// The federate's name.
+        federate: String,
+        /// The peer's federate id.
+        downstream: u16,
+        /// As in `Measures`.
+        measures: Downstream,
+    },
+    /// How well the federate knows physical time; with `Progress`.
+    Clock {
+        /// The federate's name.
+        federate: String,
+        /// The latest state.
+        clock: ClockStatus,
+    },
+    /// A message came after its input had been decided; told of an upstream's first, and then at every power of ten.
+    StpViolation {
+        /// The federate's name.
+        federate: String,
+        /// The sender's federate id.
+        upstream: u16,
+        /// By how much this one was late, in nanoseconds.
+        lateness_ns: i64,
+        /// How many from this upstream so far.
+        count: u64,
+    },
+    /// The federate's lag keeps growing.
+    FallingBehind {
+        /// The federate's name.
+        federate: String,
+        /// The lag in nanoseconds.
+        lag_ns: i64,
+    },
+    /// The federate's lag is small again.
+    CaughtUp {
+        /// The federate's name.
+        federate: String,
+        /// The lag in nanoseconds.
+        lag_ns: i64,
+    },
+    /// A clock was stepped: the federate's host's, or the RTI's.
+    ClockStep {
+        /// The federate's name.
+        federate: String,
+        /// How far, in nanoseconds; positive when forward.
+        by_ns: i64,
     },
     /// The federate's last word; the process exits next.
     Ended {
