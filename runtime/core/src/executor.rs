@@ -17,6 +17,12 @@ pub trait Executor {
     /// Runs one node and adds what it did to `effects`.
     ///
     /// For a user reaction: its body or deadline handler. For a forwarder: copies the slot's value to the
-    /// connection's queue and schedules it. For a sender: hands the slot's value to the transport.
+    /// connection's queue and adds it with [`Effects::forward`]. For a sender: hands the slot's value to the transport.
     fn run(&mut self, node: NodeId, tag: Tag, effects: &mut Effects);
+
+    /// Runs one node that should have run at `intended`, before `tag`: a reaction's STP handler, when it has one.
+    fn run_tardy(&mut self, node: NodeId, tag: Tag, intended: Tag, effects: &mut Effects) {
+        let _ = intended;
+        self.run(node, tag, effects);
+    }
 }

@@ -44,6 +44,11 @@ pub enum ActionKind {
         /// The input.
         input: InputId,
     },
+    /// When a value came over a physical connection: the tag comes from the receiver's physical clock.
+    PhysicalConnection {
+        /// The connection's `after`: added to the physical time of the arrival.
+        min_delay: Duration,
+    },
 }
 
 /// What makes a reaction run.
@@ -190,6 +195,8 @@ pub struct NetworkInput {
     pub action: ActionId,
     /// Whether several messages may claim one tag (the connection has a delay): the n-th goes n microsteps later.
     pub delayed: bool,
+    /// Whether its messages carry no tag: they are scheduled by physical time, and its status is never unknown.
+    pub physical: bool,
 }
 
 impl ProgramBuilder {
@@ -262,6 +269,20 @@ impl ProgramBuilder {
         action
     }
 
+    /// Connects two ports of this program by a physical connection: a value's tag at `to` is the physical time at which
+    /// it was set plus `min_delay`. No dependency without delay goes through it.
+    ///
+    /// [`Effects::physical`](crate::Effects::physical) lists what was set.
+    pub fn connect_physical(&mut self, from: PortId, to: PortId, min_delay: Duration) -> ActionId {
+        let action = self.action(ActionKind::PhysicalConnection { min_delay });
+        self.connections.push(Connection {
+            from,
+            to,
+            action: Some(action),
+        });
+        action
+    }
+
     /// Declares that `port` is fed by another federate over a connection that is `delayed` or not.
     pub fn network_input(&mut self, port: PortId, delayed: bool) -> InputId {
         let input = InputId::new(self.inputs.len());
@@ -270,6 +291,22 @@ impl ProgramBuilder {
             port,
             action,
             delayed,
+            physical: false,
+        });
+        input
+    }
+
+    /// Declares that `port` is fed by another federate over a physical connection: a message's tag is the physical time
+    /// of its arrival plus `min_delay`. It goes to [`Timeline::schedule_physical`](crate::Timeline::schedule_physical)
+    /// with the input's action.
+    pub fn network_input_physical(&mut self, port: PortId, min_delay: Duration) -> InputId {
+        let input = InputId::new(self.inputs.len());
+        let action = self.action(ActionKind::PhysicalConnection { min_delay });
+        self.inputs.push(NetworkInput {
+            port,
+            action,
+            delayed: false,
+            physical: true,
         });
         input
     }
@@ -575,7 +612,8 @@ pub(crate) struct Relations {
 impl Relations {
     fn new(graph: &Graph, inputs: &[NetworkInput], slots: &[SlotId], tables: &SlotTables) -> Self {
         let mut direct = vec![BitSet::new(inputs.len()); graph.levels.len()];
-        for (i, input) in inputs.iter().enumerate() {
+        let tagged = inputs.iter().enumerate().filter(|(_, i)| !i.physical);
+        for (i, input) in tagged {
             for reader in &tables.readers[slots[input.port.index()].index()] {
                 direct[reader.index()].insert(i);
             }
@@ -743,11 +781,13 @@ impl Program {
         false
     }
 
-    /// The least minimum delay over all physical actions, or `None` when there is none.
+    /// The least minimum delay over all physical actions and connections, or `None` when there is none: what comes from
+    /// outside never gets a tag before physical time plus this.
     #[must_use]
     pub fn least_physical_delay(&self) -> Option<Duration> {
         let delays = self.actions.iter().filter_map(|action| match action {
-            ActionKind::Physical { min_delay, .. } => Some(*min_delay),
+            ActionKind::Physical { min_delay, .. }
+            | ActionKind::PhysicalConnection { min_delay } => Some(*min_delay),
             ActionKind::Startup
             | ActionKind::Shutdown
             | ActionKind::Timer { .. }

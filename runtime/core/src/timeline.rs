@@ -7,7 +7,15 @@
 //! ```
 //!
 //! `finish` may be called per node, in any order, while others are in flight; `admit`, `settle` and
-//! `schedule_physical` at any time.
+//! `schedule_physical` at any time. What a node set over physical connections stays in [`Effects::physical`] after `finish`:
+//! the caller drains it into `schedule_physical`.
+//!
+//! A message whose tag is over is *tardy*: it is due at the next free microstep after the current tag. The nodes that it
+//! triggers there are tardy, and so are those that they trigger at that tag by setting slots: `finish` passes it on
+//! from its whole batch, so while [`Timeline::any_tardy`] the caller runs and finishes node by node.
+
+mod ready;
+mod tardiness;
 
 use crate::graph::BitSet;
 use crate::id::{ActionId, InputId, NodeId, OutputId, SlotId, ValueId};
@@ -15,7 +23,9 @@ use crate::program::{ActionKind, NetworkInput, NodeKind, Program};
 use crate::queue::EventQueue;
 use crate::tag::{Delay, Tag};
 use crate::time::{Duration, LogicalTime, PhysicalTime};
+use ready::ReadyLists;
 use std::sync::Arc;
+use tardiness::Tardiness;
 
 /// What running nodes did.
 #[derive(Debug, Default)]
@@ -24,8 +34,31 @@ pub struct Effects {
     pub set: Vec<SlotId>,
     /// Events to schedule from the current tag.
     pub scheduled: Vec<Scheduled>,
+    /// Values that were set over physical connections: the caller's to schedule by physical time.
+    pub physical: Vec<(ActionId, ValueId)>,
     /// Whether a reaction asked for the federation to stop.
     pub stop: bool,
+}
+
+impl Effects {
+    /// Adds what a forwarder did: `value` goes over the connection of `action`, delayed or physical.
+    #[inline]
+    pub fn forward(&mut self, program: &Program, action: ActionId, value: ValueId) {
+        match program.actions[action.index()] {
+            ActionKind::PhysicalConnection { .. } => self.physical.push((action, value)),
+            ActionKind::Connection { .. }
+            | ActionKind::Startup
+            | ActionKind::Shutdown
+            | ActionKind::Timer { .. }
+            | ActionKind::Logical { .. }
+            | ActionKind::Physical { .. }
+            | ActionKind::Network { .. } => self.scheduled.push(Scheduled {
+                action,
+                delay: Duration::ZERO,
+                value,
+            }),
+        }
+    }
 }
 
 /// An event scheduled by a reaction or by a forwarder.
@@ -95,6 +128,7 @@ struct State {
     unknown: BitSet,
     unknown_count: u32,
     latest: Vec<Tag>,
+    tardiness: Tardiness,
     network_inputs_ran: bool,
     overflow: bool,
 }
@@ -113,8 +147,12 @@ impl Timeline {
     pub fn new(program: Arc<Program>) -> Self {
         let inputs = program.inputs.iter();
         let inputs = inputs
-            .map(|_| InputStatus {
-                known: Tag::NEVER,
+            .map(|input| InputStatus {
+                known: if input.physical {
+                    Tag::FOREVER
+                } else {
+                    Tag::NEVER
+                },
                 last: Tag::NEVER,
             })
             .collect();
@@ -128,6 +166,7 @@ impl Timeline {
             }),
             unknown: BitSet::new(program.inputs.len()),
             latest: vec![Tag::NEVER; program.actions.len()],
+            tardiness: Tardiness::new(nodes),
             queue: EventQueue::default(),
             start: Tag::NEVER,
             stop: Tag::FOREVER,
@@ -163,6 +202,7 @@ impl Timeline {
                 | ActionKind::Logical { .. }
                 | ActionKind::Physical { .. }
                 | ActionKind::Connection { .. }
+                | ActionKind::PhysicalConnection { .. }
                 | ActionKind::Network { .. } => continue,
             };
             self.state.queue.push(tag, action, ValueId::NONE);
@@ -250,6 +290,9 @@ impl Timeline {
             state.fire(program, ActionId::SHUTDOWN);
             present.push((ActionId::SHUTDOWN, ValueId::NONE));
         }
+        if state.tardiness.any_queued() {
+            state.tardiness.fire(tag, program);
+        }
     }
 
     /// Begins the stop tag with nothing but shutdown: events that are due before it are dropped.
@@ -257,6 +300,7 @@ impl Timeline {
     /// For a federate whose upstream was lost: an ordinary tag past the lost one's last promise could be wrong.
     pub fn begin_shutdown_only(&mut self, present: &mut Vec<(ActionId, ValueId)>) {
         self.state.queue = EventQueue::default();
+        self.state.tardiness.drop_queued();
         self.settle_all(Tag::FOREVER);
         self.begin(self.state.stop, present);
     }
@@ -316,7 +360,7 @@ impl Timeline {
     }
 
     /// Takes what `batch` did: triggers what its outputs trigger, queues what it scheduled. Drains `effects` but for
-    /// `stop`, which the caller reads.
+    /// `stop`, which the caller reads, and `physical`, which the caller schedules by physical time.
     #[inline]
     pub fn finish(&mut self, batch: &[NodeId], effects: &mut Effects) {
         self.state.in_flight -= u32::try_from(batch.len()).unwrap_or(u32::MAX);
@@ -325,6 +369,9 @@ impl Timeline {
             for node in batch {
                 state.busy.remove(node.index());
             }
+        }
+        if state.tardiness.any() {
+            state.tardiness.pass_on(batch, &effects.set, program);
         }
         for slot in &effects.set {
             state.trigger(&program.slot_triggers[slot.index()], program);
@@ -341,7 +388,7 @@ impl Timeline {
     ///
     /// # Panics
     ///
-    /// When `action` is not a physical action.
+    /// When `action` is neither a physical action nor that of a physical connection.
     pub fn schedule_physical(
         &mut self,
         stamp: PhysicalTime,
@@ -349,12 +396,20 @@ impl Timeline {
         value: ValueId,
         floor: Tag,
     ) -> Tag {
-        let ActionKind::Physical {
-            min_delay,
-            min_spacing,
-        } = self.program.actions[action.index()]
-        else {
-            unreachable!("only physical actions are scheduled from outside")
+        let (min_delay, min_spacing) = match self.program.actions[action.index()] {
+            ActionKind::Physical {
+                min_delay,
+                min_spacing,
+            } => (min_delay, min_spacing),
+            ActionKind::PhysicalConnection { min_delay } => (min_delay, Duration::ZERO),
+            ActionKind::Startup
+            | ActionKind::Shutdown
+            | ActionKind::Timer { .. }
+            | ActionKind::Logical { .. }
+            | ActionKind::Connection { .. }
+            | ActionKind::Network { .. } => {
+                unreachable!("only physical actions are scheduled from outside")
+            }
         };
         let wanted = Tag::new(stamp.saturating_add(min_delay).as_logical(), 0);
         let after_current = self.state.at.successor();
@@ -375,6 +430,7 @@ impl Timeline {
     /// Takes a message from another federate for `input` with the tag it carries.
     ///
     /// Over a delayed connection the n-th message for one tag goes n-1 microsteps later, in the order of the connection.
+    /// Tardy ones go to the next free microsteps after the current tag.
     pub fn admit(&mut self, input: InputId, tag: Tag, value: ValueId) -> Admission {
         let NetworkInput {
             action, delayed, ..
@@ -400,6 +456,7 @@ impl Timeline {
         }
         let next = self.state.at.successor();
         let actual = self.state.enqueue(next, action, value);
+        self.state.tardiness.queue(actual, action, tag);
         Admission::Tardy {
             intended: tag,
             actual,
@@ -409,9 +466,51 @@ impl Timeline {
     /// Unlearns the status of all inputs after `through`: a stop was agreed, at which others may write what they had not
     /// announced. `through` is at or after the current tag.
     pub fn unsettle_after(&mut self, through: Tag) {
-        for status in &mut self.state.inputs {
-            status.known = status.known.min(through);
+        for (status, input) in self.state.inputs.iter_mut().zip(&self.program.inputs) {
+            if !input.physical {
+                status.known = status.known.min(through);
+            }
         }
+    }
+
+    /// The tag up to and including which the status of `input` is known; FOREVER for a physical connection.
+    #[must_use]
+    pub fn known(&self, input: InputId) -> Tag {
+        self.state.inputs[input.index()].known
+    }
+
+    /// The inputs whose status is unknown at the current tag, in order; none between tags.
+    pub fn unknown_inputs(&self) -> impl Iterator<Item = InputId> + '_ {
+        let State {
+            executing,
+            unknown,
+            unknown_count,
+            ..
+        } = &self.state;
+        let count = if *executing && *unknown_count > 0 {
+            self.program.inputs.len()
+        } else {
+            0
+        };
+        (0..count)
+            .filter(|index| unknown.contains(*index))
+            .map(InputId::new)
+    }
+
+    /// The tag at which `node` should have run, when a tardy message led to it; while it is ready or in flight.
+    ///
+    /// Law `tardiness_is_passed_on`: it is the least intended tag over the tardy messages that led to the node at the
+    /// current tag.
+    #[must_use]
+    pub fn tardy(&self, node: NodeId) -> Option<Tag> {
+        self.state.tardiness.of(node)
+    }
+
+    /// Whether a node that is ready or in flight is tardy.
+    #[inline]
+    #[must_use]
+    pub fn any_tardy(&self) -> bool {
+        self.state.tardiness.any()
     }
 
     /// Learns that the status of `input` is known up to and including `through`.
@@ -436,6 +535,7 @@ impl Timeline {
         self.state.busy.clear();
         self.state.unknown.clear();
         self.state.unknown_count = 0;
+        self.state.tardiness.clear();
     }
 
     /// Ends the current tag and says whether a network input was present at it.
@@ -495,6 +595,7 @@ impl State {
             | ActionKind::Shutdown
             | ActionKind::Logical { .. }
             | ActionKind::Physical { .. }
+            | ActionKind::PhysicalConnection { .. }
             | ActionKind::Connection { .. } => {}
         }
         self.trigger(&program.action_triggers[action.index()], program);
@@ -521,6 +622,7 @@ impl State {
             | ActionKind::Shutdown
             | ActionKind::Timer { .. }
             | ActionKind::Physical { .. }
+            | ActionKind::PhysicalConnection { .. }
             | ActionKind::Network { .. } => {
                 debug_assert!(false, "reactions schedule logical actions only");
                 return;
@@ -564,94 +666,6 @@ impl State {
             Progress::TagDone
         } else {
             Progress::Blocked
-        }
-    }
-}
-
-/// Triggered nodes by level.
-#[derive(Debug)]
-struct ReadyLists {
-    levels: Vec<Vec<NodeId>>,
-    lowest: usize,
-    count: usize,
-    marked: Vec<bool>,
-}
-
-impl ReadyLists {
-    fn new(program: &Program) -> Self {
-        let levels = program
-            .levels
-            .iter()
-            .map(|l| *l as usize + 1)
-            .max()
-            .unwrap_or(0);
-        Self {
-            levels: vec![Vec::new(); levels],
-            lowest: 0,
-            count: 0,
-            marked: vec![false; program.nodes.len()],
-        }
-    }
-
-    fn is_empty(&self) -> bool {
-        self.count == 0
-    }
-
-    fn clear(&mut self) {
-        self.levels.iter_mut().for_each(Vec::clear);
-        self.marked.fill(false);
-        self.count = 0;
-    }
-
-    /// Adds a node once; says whether it was not there yet.
-    #[inline]
-    fn insert(&mut self, node: NodeId, level: u32) -> bool {
-        if std::mem::replace(&mut self.marked[node.index()], true) {
-            return false;
-        }
-        let level = level as usize;
-        self.levels[level].push(node);
-        self.lowest = if self.count == 0 {
-            level
-        } else {
-            self.lowest.min(level)
-        };
-        self.count += 1;
-        true
-    }
-
-    #[inline]
-    fn take_lowest(&mut self, batch: &mut Vec<NodeId>) {
-        if self.count == 0 {
-            return;
-        }
-        while self.levels[self.lowest].is_empty() {
-            self.lowest += 1;
-        }
-        let list = &mut self.levels[self.lowest];
-        self.count -= list.len();
-        for node in list.iter() {
-            self.marked[node.index()] = false;
-        }
-        if batch.is_empty() {
-            std::mem::swap(batch, list);
-        } else {
-            batch.append(list);
-        }
-    }
-
-    fn take_if(&mut self, batch: &mut Vec<NodeId>, free: impl Fn(NodeId) -> bool) {
-        let (marked, count) = (&mut self.marked, &mut self.count);
-        for list in &mut self.levels[self.lowest..] {
-            list.retain(|node| {
-                let take = free(*node);
-                if take {
-                    marked[node.index()] = false;
-                    *count -= 1;
-                    batch.push(*node);
-                }
-                !take
-            });
         }
     }
 }

@@ -342,3 +342,200 @@ proptest! {
         }
     }
 }
+
+/// An input fed by the network, its reader, what the reader triggers, and a reaction that nothing late reaches.
+///
+/// Nodes: 0 and 1 read one input each and set `middle[0]` and `middle[1]`; 2 reads both; 3 has a timer of 10 ns.
+fn late_program() -> Arc<Program> {
+    let mut builder = ProgramBuilder::new();
+    let last = builder.reactor("last");
+    let mut triggers = Vec::new();
+    for name in ["a", "b"] {
+        let reactor = builder.reactor(name);
+        let input = builder.port(reactor, "in", PortKind::Input);
+        let out = builder.port(reactor, "out", PortKind::Output);
+        let end = builder.port(last, name, PortKind::Input);
+        builder.connect(out, end, Delay::None);
+        builder.network_input(input, false);
+        builder.reaction(spec(reactor, &[Trigger::Port(input)], &[out]));
+        triggers.push(Trigger::Port(end));
+    }
+    let other = builder.reactor("other");
+    let tick = timer(&mut builder, 10.ns());
+    builder.reaction(spec(last, &triggers, &[]));
+    builder.reaction(spec(other, &[tick], &[]));
+    Arc::new(builder.build().unwrap())
+}
+
+/// Runs the next tag node by node; returns it and which node ran with which intended tag.
+fn step(timeline: &mut Timeline) -> (Tag, Vec<(usize, Option<Tag>)>) {
+    let program = Arc::clone(timeline.program());
+    let tag = timeline.next_tag();
+    timeline.begin(tag, &mut Vec::new());
+    let (mut ran, mut effects) = (Vec::new(), Effects::default());
+    let mut batch = Vec::new();
+    while timeline.ready(&mut batch) == Progress::Batch {
+        for node in batch.drain(..) {
+            ran.push((node.index(), timeline.tardy(node)));
+            let spec = &program.reactions()[node.index()].spec;
+            let set = spec.effects.iter().map(|port| program.slot(*port));
+            effects.set.extend(set);
+            timeline.finish(&[node], &mut effects);
+            assert_eq!(timeline.tardy(node), None, "it is done");
+        }
+    }
+    assert!(!timeline.any_tardy());
+    timeline.complete();
+    ran.sort_unstable_by_key(|(node, _)| *node);
+    (tag, ran)
+}
+
+fn input(index: usize) -> ictus_core::InputId {
+    ictus_core::InputId::new(index)
+}
+
+#[test]
+fn what_a_tardy_message_leads_to_is_tardy_and_nothing_else() {
+    let mut timeline = Timeline::new(late_program());
+    timeline.start(Tag::at(0), Tag::FOREVER);
+    timeline.settle_all(Tag::at(30));
+    assert_eq!(step(&mut timeline), (Tag::at(0), vec![(3, None)]));
+    timeline.admit(input(1), Tag::at(0), ValueId::new(0));
+    timeline.admit(input(0), tag(0, 1), ValueId::new(0));
+    // `a` is in time, `b` is not, and what both lead to is not.
+    let late = Some(Tag::at(0));
+    assert_eq!(
+        step(&mut timeline),
+        (tag(0, 1), vec![(0, None), (1, late), (2, late)])
+    );
+    timeline.admit(input(0), tag(10, 0), ValueId::new(0));
+    assert_eq!(
+        step(&mut timeline),
+        (Tag::at(10), vec![(0, None), (2, None), (3, None)])
+    );
+}
+
+#[test]
+fn an_input_decided_while_its_tag_runs_is_tardy_at_the_next_microstep() {
+    let mut timeline = Timeline::new(late_program());
+    timeline.start(Tag::at(0), Tag::FOREVER);
+    timeline.settle(input(0), Tag::at(0));
+    timeline.begin(Tag::at(0), &mut Vec::new());
+    assert_eq!(timeline.unknown_inputs().collect::<Vec<_>>(), [input(1)]);
+    assert_eq!(timeline.known(input(0)), Tag::at(0));
+    assert_eq!(timeline.known(input(1)), Tag::NEVER);
+    timeline.settle(input(1), Tag::at(0));
+    assert_eq!(timeline.unknown_inputs().count(), 0);
+    let program = Arc::clone(timeline.program());
+    drive(&mut timeline, &program);
+    let admission = timeline.admit(input(1), Tag::at(0), ValueId::new(0));
+    let actual = tag(0, 1);
+    assert_eq!(
+        admission,
+        Admission::Tardy {
+            intended: Tag::at(0),
+            actual
+        }
+    );
+    assert!(!timeline.any_tardy(), "not at this tag");
+    timeline.complete();
+    timeline.settle_all(actual);
+    let late = Some(Tag::at(0));
+    assert_eq!(step(&mut timeline), (actual, vec![(1, late), (2, late)]));
+}
+
+#[test]
+fn tardy_events_are_dropped_with_the_rest_when_only_shutdown_is_left() {
+    let mut timeline = Timeline::new(late_program());
+    timeline.start(Tag::at(0), Tag::at(50));
+    timeline.settle_all(Tag::at(0));
+    step(&mut timeline);
+    timeline.admit(input(0), Tag::at(0), ValueId::new(0));
+    timeline.begin_shutdown_only(&mut Vec::new());
+    assert!(!timeline.any_tardy());
+}
+
+#[test]
+fn a_physical_input_is_never_unknown_and_breaks_the_loop() {
+    let mut builder = ProgramBuilder::new();
+    let (a, b) = (builder.reactor("a"), builder.reactor("b"));
+    let (from, back) = (
+        builder.port(a, "out", PortKind::Output),
+        builder.port(a, "in", PortKind::Input),
+    );
+    let (to, answer) = (
+        builder.port(b, "in", PortKind::Input),
+        builder.port(b, "out", PortKind::Output),
+    );
+    let far = builder.port(b, "far", PortKind::Input);
+    let connection = builder.connect_physical(from, to, 5.ns());
+    builder.connect(answer, back, Delay::None);
+    let start = Trigger::Action(ActionId::STARTUP);
+    builder.reaction(spec(a, &[start, Trigger::Port(back)], &[from]));
+    builder.reaction(spec(b, &[Trigger::Port(to), Trigger::Port(far)], &[answer]));
+    let network = builder.network_input_physical(far, 2.ns());
+    let program = Arc::new(builder.build().unwrap());
+    assert_eq!(program.least_physical_delay(), Some(2.ns()));
+    assert!(!program.depends_without_delay(from, to));
+
+    let mut timeline = Timeline::new(Arc::clone(&program));
+    timeline.start(Tag::at(10), Tag::FOREVER);
+    timeline.unsettle_after(Tag::at(10));
+    assert_eq!(timeline.known(network), Tag::FOREVER);
+    timeline.begin(Tag::at(10), &mut Vec::new());
+    assert_eq!(timeline.unknown_inputs().count(), 0);
+    let (ran, progress) = drive(&mut timeline, &program);
+    // Node 2 is the connection's forwarder.
+    assert_eq!((ran, progress), (vec![0, 2], Progress::TagDone));
+    let mut effects = Effects::default();
+    effects.forward(&program, connection, ValueId::new(7));
+    timeline.finish(&[], &mut effects);
+    assert_eq!(effects.physical, [(connection, ValueId::new(7))]);
+    assert!(!timeline.complete(), "no message with a tag was there");
+    let event = |timeline: &mut Timeline, action, now| {
+        let stamp = PhysicalTime::from_nanos(now);
+        timeline.schedule_physical(stamp, action, ValueId::new(7), Tag::NEVER)
+    };
+    assert_eq!(event(&mut timeline, connection, 20), Tag::at(25));
+    assert_eq!(event(&mut timeline, connection, 20), tag(25, 1));
+    let action = program.network_inputs()[network.index()].action;
+    assert_eq!(event(&mut timeline, action, 3), tag(10, 1));
+    let mut present = Vec::new();
+    timeline.begin(tag(10, 1), &mut present);
+    assert_eq!(present, [(action, ValueId::new(7))]);
+    assert_eq!(drive(&mut timeline, &program).0, [1, 0, 2]);
+    assert!(!timeline.complete(), "no message with a tag was there");
+}
+
+proptest! {
+    /// Tardy messages keep their order, one a microstep, and each node runs with the least intended tag that led to it.
+    #[test]
+    fn tardiness_is_passed_on(messages in prop::collection::vec((0usize..2, 0i64..=50), 1..12)) {
+        let mut timeline = Timeline::new(late_program());
+        timeline.start(Tag::at(0), Tag::FOREVER);
+        timeline.settle_all(Tag::at(55));
+        while timeline.at() < Tag::at(50) {
+            step(&mut timeline);
+        }
+        let mut intended: [Vec<Tag>; 2] = Default::default();
+        for (value, (index, time)) in messages.into_iter().enumerate() {
+            let queue = &mut intended[index];
+            let actual = tag(50, u32::try_from(queue.len()).unwrap() + 1);
+            let admission = timeline.admit(input(index), Tag::at(time), ValueId::new(value));
+            prop_assert_eq!(admission, Admission::Tardy { intended: Tag::at(time), actual });
+            queue.push(Tag::at(time));
+        }
+        for round in 0..intended[0].len().max(intended[1].len()) {
+            let late = [intended[0].get(round).copied(), intended[1].get(round).copied()];
+            let both = late.iter().flatten().min().copied();
+            let expected: Vec<_> = [(0, late[0]), (1, late[1]), (2, both)]
+                .into_iter()
+                .filter(|(_, late)| late.is_some())
+                .collect();
+            let (at, ran) = step(&mut timeline);
+            prop_assert_eq!(at, tag(50, u32::try_from(round).unwrap() + 1));
+            prop_assert_eq!(ran, expected);
+        }
+        prop_assert_eq!(timeline.next_tag(), Tag::at(60));
+    }
+}

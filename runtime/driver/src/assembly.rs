@@ -119,6 +119,14 @@ pub enum AssemblyError {
         /// The serializer.
         serializer: String,
     },
+    /// A plan that runs ahead of physical time has something that is scheduled by it.
+    #[error("`fast`, but {what} `{path}` is scheduled by the physical clock")]
+    Fast {
+        /// `the physical action`, or `the physical connection to`.
+        what: &'static str,
+        /// The action, or the receiving port.
+        path: String,
+    },
     /// A mistake in a `#[connections]` function.
     #[error(transparent)]
     Wiring(#[from] WiringError),
@@ -148,6 +156,7 @@ impl Assembly {
         for index in 0..plan.connections.len() {
             assembler.connect(index)?;
         }
+        assembler.check_fast()?;
         assembler.finish()
     }
 }
@@ -261,9 +270,14 @@ impl<'a> Assembler<'a> {
             (None, Some(to)) => {
                 let receiver = to.typed.receiver(to.port, &connection.serializer);
                 let receiver = receiver.ok_or_else(|| self.no_serializer(connection, &to))?;
-                let delayed = connection.after_ns.is_some();
-                self.elaboration.program.network_input(to.port, delayed);
-                self.elaboration.carriers.push(receiver);
+                if connection.physical {
+                    self.elaboration
+                        .physical_input(to.port, min_delay(connection), receiver);
+                } else {
+                    let delayed = connection.after_ns.is_some();
+                    self.elaboration.program.network_input(to.port, delayed);
+                    self.elaboration.carriers.push(receiver);
+                }
                 self.input_types.push(to.typed.identity().name);
                 self.inputs.push(index);
             }
@@ -286,12 +300,38 @@ impl<'a> Assembler<'a> {
                 to_type: to_type.name,
             });
         }
+        let ends = (from.port, to.port);
+        if connection.physical {
+            self.elaboration
+                .connect_physical(ends, min_delay(connection), &*from.typed);
+            return Ok(());
+        }
         let delay = connection
             .after_ns
             .map_or(Delay::None, |ns| Delay::after(Duration::from_nanos(ns)));
-        self.elaboration
-            .connect((from.port, to.port), delay, &*from.typed);
+        self.elaboration.connect(ends, delay, &*from.typed);
         Ok(())
+    }
+
+    /// A plan that runs ahead of physical time cannot have what is scheduled by it, here or at another federate.
+    fn check_fast(&self) -> Result<(), AssemblyError> {
+        if !self.plan.fast {
+            return Ok(());
+        }
+        let mut connections = self.plan.connections.iter();
+        if let Some(found) = connections.find(|c| c.physical) {
+            return Err(AssemblyError::Fast {
+                what: "the physical connection to",
+                path: self.end_path(&found.to),
+            });
+        }
+        let action = self.elaboration.physical.first();
+        action.map_or(Ok(()), |(_, path)| {
+            Err(AssemblyError::Fast {
+                what: "the physical action",
+                path: path.clone(),
+            })
+        })
     }
 
     /// The port at an end of a connection; `None` when its federate is elsewhere.
@@ -394,6 +434,12 @@ impl<'a> Assembler<'a> {
             outputs: self.outputs,
         })
     }
+}
+
+/// What a physical connection adds to the physical time of an arrival.
+fn min_delay(connection: &ConnectionPlan) -> Duration {
+    let after = connection.after_ns.unwrap_or(0);
+    Duration::from_nanos(after.max(0))
 }
 
 /// One channel of a top-level port.

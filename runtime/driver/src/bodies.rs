@@ -12,7 +12,7 @@ use crate::slot::Epoch;
 use ictus_coord::{FederateExecutor, PayloadError};
 use ictus_core::{
     ActionId, Duration, Effects, Executor, InputId, NodeId, NodeKind, OutputId, PhysicalTime,
-    Program, Scheduled, SlotId, Tag, ValueId,
+    Program, SlotId, Tag, ValueId,
 };
 use std::any::Any;
 use std::fmt;
@@ -32,7 +32,7 @@ pub struct Bodies {
     pub(crate) senders: Vec<Box<dyn Sender>>,
     /// The type names of network inputs, by input id.
     pub(crate) input_types: Vec<String>,
-    /// Paths of the physical actions.
+    /// Paths of the physical actions and of the ports that physical connections feed.
     pub(crate) physical: Vec<(ActionId, String)>,
     pub(crate) outside: Arc<Outside>,
     pub(crate) observer: Option<Observer>,
@@ -244,11 +244,7 @@ impl Executor for Bodies {
             NodeKind::Reaction => self.react(node, effects),
             NodeKind::Forward { action } => {
                 let value = self.carriers[action.index()].forward();
-                effects.scheduled.push(Scheduled {
-                    action,
-                    delay: Duration::ZERO,
-                    value,
-                });
+                effects.forward(&self.program, action, value);
             }
             // The value stays in its slot; the federate asks for its bytes with `encode`.
             NodeKind::Send { .. } => {}

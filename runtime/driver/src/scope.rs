@@ -27,7 +27,7 @@ pub(crate) struct Elaboration {
     pub(crate) ports: Vec<DeclaredPort>,
     pub(crate) bodies: Vec<BodyEntry>,
     pub(crate) carriers: Vec<Box<dyn Carrier>>,
-    /// Reactor paths and the names of physical actions, for the trace.
+    /// Paths of physical actions and of ports that physical connections feed, for the trace.
     pub(crate) physical: Vec<(ActionId, String)>,
     pub(crate) errors: Vec<WiringError>,
     startup: Signal,
@@ -145,6 +145,31 @@ impl Elaboration {
         if let Some(action) = self.program.connect(from, to, delay) {
             self.carry(action, typed.delayed(from, to));
         }
+    }
+
+    pub(crate) fn connect_physical(
+        &mut self,
+        (from, to): (PortId, PortId),
+        min_delay: Duration,
+        typed: &dyn PortType,
+    ) {
+        let action = self.program.connect_physical(from, to, min_delay);
+        self.carry(action, typed.delayed(from, to));
+        self.physical.push((action, self.program.port_path(to)));
+    }
+
+    /// Adds an input that another federate feeds over a physical connection.
+    pub(crate) fn physical_input(
+        &mut self,
+        to: PortId,
+        min_delay: Duration,
+        receiver: Box<dyn Carrier>,
+    ) {
+        self.program.network_input_physical(to, min_delay);
+        // The input's action is the program's last.
+        let action = ActionId::new(self.carriers.len());
+        self.carry(action, receiver);
+        self.physical.push((action, self.program.port_path(to)));
     }
 }
 

@@ -241,11 +241,7 @@ impl SyntheticExecutor {
         let slot = self.assembly.forwards[action.index()].expect("every forwarder has a source");
         if let Some(value) = self.slots[slot.index()] {
             let value = self.hold(value);
-            effects.scheduled.push(Scheduled {
-                action,
-                delay: Duration::ZERO,
-                value,
-            });
+            effects.forward(&self.assembly.program, action, value);
         }
     }
 

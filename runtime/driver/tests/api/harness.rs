@@ -54,7 +54,6 @@ impl World {
         Self {
             plan: Plan {
                 federation: "test".to_owned(),
-                fast: true,
                 extensions: true,
                 ..Plan::default()
             },
@@ -88,6 +87,17 @@ impl World {
             port_id,
             ..ConnectionPlan::default()
         });
+        self
+    }
+
+    /// Makes the connection added last a physical one.
+    pub fn physical(mut self) -> Self {
+        self.plan.connections.last_mut().unwrap().physical = true;
+        self
+    }
+
+    pub fn fast(mut self) -> Self {
+        self.plan.fast = true;
         self
     }
 
@@ -140,7 +150,7 @@ impl World {
         });
         let mut timeline = Timeline::new(Arc::clone(&assembly.program));
         timeline.start(START, stop);
-        drive(&mut timeline, bodies);
+        drive(&mut timeline, bodies, &self.clock);
         let end = timeline.at();
         bodies.note_end(end, "test").unwrap();
         Ran {
@@ -158,7 +168,7 @@ impl World {
 }
 
 /// The loop of one process, without waiting.
-fn drive(timeline: &mut Timeline, bodies: &mut ictus::Bodies) {
+fn drive(timeline: &mut Timeline, bodies: &mut ictus::Bodies, clock: &TestClock) {
     let mut effects = Effects::default();
     let (mut batch, mut present) = (Vec::<NodeId>::new(), Vec::new());
     let mut events = Vec::new();
@@ -187,6 +197,10 @@ fn drive(timeline: &mut Timeline, bodies: &mut ictus::Bodies) {
             }
             timeline.finish(&batch, &mut effects);
             batch.clear();
+            for (action, value) in effects.physical.drain(..) {
+                let tag = timeline.schedule_physical(clock.now(), action, value, Tag::NEVER);
+                bodies.note_physical(action, tag);
+            }
             if std::mem::take(&mut effects.stop) {
                 timeline.stop_at(tag.next_microstep().unwrap());
             }

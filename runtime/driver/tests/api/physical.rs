@@ -1,9 +1,8 @@
-//! Physical actions: events from other threads.
+//! Physical actions, which are events from other threads, and physical connections.
 
 use crate::harness::{World, at, d, line};
-use ictus::Class;
-use ictus::SendError;
 use ictus::prelude::*;
+use ictus::{AssemblyError, Class, SendError};
 use std::sync::{Mutex, OnceLock};
 
 static SENDER: OnceLock<PhysicalSender<u32>> = OnceLock::new();
@@ -75,5 +74,102 @@ fn after_the_end_the_value_comes_back() {
     assert_eq!(
         sender.schedule("late".to_owned()),
         Err(SendError("late".to_owned()))
+    );
+}
+
+#[reactor]
+struct Pulse {
+    #[timer(offset = 1.ms())]
+    tick: Timer,
+    back: Input<u32>,
+    out: Output<u32>,
+}
+
+#[reactions]
+impl Pulse {
+    #[reaction]
+    fn send(&mut self, _tick: &Timer, #[uses] back: &Input<u32>, out: &mut Output<u32>) {
+        out.set(back.get().map_or(1, |value| value + 1));
+    }
+}
+
+#[reactor]
+struct Echo {
+    input: Input<u32>,
+    out: Output<u32>,
+}
+
+#[reactions]
+impl Echo {
+    #[reaction]
+    fn echo(&mut self, input: &Input<u32>, out: &mut Output<u32>) {
+        out.set(*input.get().unwrap());
+    }
+}
+
+fn pulse_and_echo() -> World {
+    World::new(&[Class::of::<Pulse>(), Class::of::<Echo>()])
+        .federate("pulse", "Pulse", "{}")
+        .federate("echo", "Echo", "{}")
+        .connect("pulse.out", "echo.input", Some(3.ms()))
+        .physical()
+}
+
+#[test]
+fn a_physical_connection_gives_the_receivers_time_and_after_is_added_there() {
+    let world = pulse_and_echo();
+    world.clock.set(10.ms());
+    let ran = world.run();
+    let expected = [
+        line((1.ms(), 0), ("pulse", 0), &[("out", d(1_u32))]),
+        "# physical 13000000 0 echo.input\n".to_owned()
+            + &line((13.ms(), 0), ("echo", 0), &[("out", d(1_u32))]),
+    ];
+    assert_eq!(ran.traces, expected);
+}
+
+#[test]
+fn a_physical_connection_breaks_a_causality_loop() {
+    let there = || {
+        World::new(&[Class::of::<Pulse>(), Class::of::<Echo>()])
+            .federate("pulse", "Pulse", "{}")
+            .federate("echo", "Echo", "{}")
+            .connect("pulse.out", "echo.input", None)
+    };
+    let back = |world: World| world.connect("echo.out", "pulse.back", None);
+    assert!(matches!(
+        back(there()).assemble(),
+        Err(AssemblyError::Program(_))
+    ));
+    let ran = back(there().physical()).run();
+    assert!(ran.traces[1].starts_with("# physical 1000000 1 echo.input\n"));
+}
+
+#[test]
+fn a_physical_connection_from_another_process_is_an_input_without_status() {
+    let world = pulse_and_echo();
+    let sender = world.assemble_some(&[0]).unwrap();
+    assert_eq!((sender.inputs, sender.outputs), (vec![], vec![0]));
+    assert_eq!(sender.program.least_physical_delay(), None);
+    let receiver = world.assemble_some(&[1]).unwrap();
+    assert_eq!((receiver.inputs, receiver.outputs), (vec![0], vec![]));
+    let input = receiver.program.network_inputs()[0];
+    assert!(input.physical && !input.delayed);
+    assert_eq!(receiver.program.least_physical_delay(), Some(3.ms()));
+}
+
+#[test]
+fn fast_is_refused_with_what_the_physical_clock_schedules() {
+    let connection = pulse_and_echo().fast();
+    for mine in [&[0][..], &[1], &[0, 1]] {
+        assert_eq!(
+            connection.assemble_some(mine).unwrap_err().to_string(),
+            "`fast`, but the physical connection to `echo.input` is scheduled by the physical clock"
+        );
+    }
+    let action = World::of(Class::of::<Once>()).fast();
+    assert_eq!(
+        action.assemble().unwrap_err().to_string(),
+        "`fast`, but the physical action `main.event` is scheduled by the physical clock"
     );
 }
