@@ -19,21 +19,32 @@
 
 mod join;
 mod link;
+mod meeting;
+mod peers;
 mod stop;
+mod timed;
 
+use crate::measure::{LagNews, Measures};
 use crate::mutants::Mutant;
 use crate::payload::{FederateExecutor, PayloadError};
 use crate::wire::{DecodeError, RejectReason};
 use ictus_core::{
-    ActionId, Admission, Delay, Duration, Effects, NodeId, NodeKind, OutputId, PhysicalTime,
-    Program, Progress, Tag, Timeline, ValueId,
+    ActionId, Admission, Delay, Duration, Effects, LogicalTime, NodeId, NodeKind, OutputId,
+    PhysicalTime, Program, Progress, Tag, Timeline, ValueId,
 };
 use join::Phase;
 pub use link::{InputLink, LinkConfig, OutputLink};
+pub use peers::PeerStream;
 use link::{Link, Permission};
 use std::collections::VecDeque;
 use std::sync::Arc;
 use thiserror::Error;
+
+/// A stream that ended without goodbye is explained by the RTI within this time, or is itself what is wrong.
+const LOSS_EXPLAINED_WITHIN: Duration = Duration::from_secs(5);
+
+/// How long the RTI and senders may take to close after a federate has said its last word.
+pub const LAST_WORDS_MAX: Duration = Duration::from_secs(5);
 
 /// How a program runs.
 #[derive(Clone, Debug, Default)]
@@ -74,6 +85,29 @@ pub enum FederateEvent {
     StopGranted(Tag),
     /// Another federate was lost; the federation stops.
     PeerLost(u16),
+    /// The driver is to connect to another federate, and to say [`Federate::peer_connected`] or
+    /// [`Federate::peer_unreachable`].
+    Connect {
+        /// The other federate.
+        peer: u16,
+        /// Its IPv4 address in network order.
+        address: [u8; 4],
+        /// Its TCP port.
+        port: u16,
+    },
+    /// Somebody who connected was refused; why, in words.
+    PeerRefused(String),
+    /// The federate falls behind physical time more and more, or has caught up.
+    Lag(LagNews),
+    /// A message came after its input had been decided at its tag: a sender's first, and then at every power of ten.
+    StpViolation {
+        /// The sender.
+        upstream: u16,
+        /// How long after its tag's time plus the offset it came, by this federate's clock.
+        lateness: Duration,
+        /// How many from this sender so far.
+        count: u64,
+    },
 }
 
 /// How a federate ended.
@@ -103,6 +137,28 @@ pub enum Outcome {
     /// The RTI refused the join.
     #[error("the RTI refused the join: {0}")]
     Rejected(RejectReason),
+    /// Another federate refused this one's hello.
+    #[error("federate {peer} refused the connection: {reason}")]
+    RejectedByPeer {
+        /// The other federate.
+        peer: u16,
+        /// Its reason.
+        reason: RejectReason,
+    },
+    /// Another federate said something that is not of the protocol.
+    #[error("federate {peer} broke the protocol: {error}")]
+    PeerProtocol {
+        /// The other federate.
+        peer: u16,
+        /// What it did.
+        error: ProtocolError,
+    },
+    /// The connection from another federate ended, though nobody says that it was lost.
+    #[error("the connection from federate {0} was cut")]
+    PeerCut(u16),
+    /// The plan's limit of STP violations was reached: this federate stopped the federation.
+    #[error("stopped the federation after {0} STP violations")]
+    TooManyViolations(u64),
     /// The RTI said something that is not of the protocol.
     #[error("the RTI broke the protocol: {0}")]
     Protocol(#[from] ProtocolError),
@@ -138,6 +194,14 @@ pub enum ProtocolError {
     /// A message for another federate.
     #[error("message for federate {0}")]
     WrongFederate(u16),
+    /// A federate wrote to a port that another one feeds, or in another way than the plan says.
+    #[error("message for port {port}, which the plan does not let federate {peer} write to like this")]
+    NotItsPort {
+        /// The port id.
+        port: u16,
+        /// The sender.
+        peer: u16,
+    },
     /// Centralized coordination promises that this cannot happen.
     #[error("message with tag {intended} for {input} arrived when the federate was at {current}")]
     Tardy {
@@ -167,6 +231,10 @@ pub struct Counters {
     pub skipped_announcements: u64,
     /// Tags that had to wait because downstreams were too far behind.
     pub held_back: u64,
+    /// Messages that came after their input had been decided at their tag.
+    pub stp_violations: u64,
+    /// Connections of strangers that were refused.
+    pub refused: u64,
 }
 
 /// One federate: a timeline and, when it is not alone, its link to the RTI.
@@ -186,6 +254,15 @@ pub struct Federate {
     counters: Counters,
     physical_delay: Option<Duration>,
     stop: stop::Stop,
+    measures: Measures,
+    /// Receivers of messages that were written since the last poll, with the logical time at which they were.
+    launches: Vec<(u16, LogicalTime)>,
+    /// Everything that had come when the clock showed this has been received.
+    looked_at: PhysicalTime,
+    /// The clock at the last poll.
+    now: PhysicalTime,
+    /// A sender that is gone without goodbye, and until when the RTI may say that it was lost.
+    unexplained: Option<(u16, PhysicalTime)>,
 }
 
 impl Federate {
@@ -207,7 +284,6 @@ impl Federate {
             physical_delay: program.least_physical_delay(),
             timeline: Timeline::new(program),
             config,
-            link,
             phase: Phase::Idle,
             answer_by: None,
             batch: Vec::new(),
@@ -217,6 +293,12 @@ impl Federate {
             outcome: None,
             counters: Counters::default(),
             stop: stop::Stop::default(),
+            measures: link.as_ref().map_or_else(Measures::default, Link::measures),
+            launches: Vec::new(),
+            looked_at: PhysicalTime::NEVER,
+            now: PhysicalTime::NEVER,
+            unexplained: None,
+            link,
         }
     }
 
@@ -230,6 +312,17 @@ impl Federate {
     #[must_use]
     pub fn counters(&self) -> Counters {
         self.counters
+    }
+
+    /// What was measured so far.
+    #[must_use]
+    pub fn measures(&self) -> &Measures {
+        &self.measures
+    }
+
+    /// What was measured so far, for the driver to add to.
+    pub fn measures_mut(&mut self) -> &mut Measures {
+        &mut self.measures
     }
 
     /// The nodes to run after [`Poll::Run`].
@@ -300,12 +393,42 @@ impl Federate {
 
     /// Decides what can be done at physical time `now`.
     pub fn poll(&mut self, now: PhysicalTime, executor: &mut impl FederateExecutor) -> Poll {
+        self.launch(now);
+        self.now = now;
         match self.phase {
-            Phase::Running => self.poll_running(now, executor),
+            Phase::Running => self.poll_until_explained(now, executor),
+            Phase::Meeting => self.meet(now),
             Phase::Ended => Poll::Ended,
             Phase::AwaitingAck | Phase::Synchronizing(_) => self.await_answer(now),
             // The others may join as late as they like.
-            Phase::Idle | Phase::AwaitingStart | Phase::Draining => Poll::Wait(None),
+            Phase::Idle | Phase::AwaitingStart => Poll::Wait(None),
+            Phase::Draining { since, .. } => self.drain(now, since),
+        }
+    }
+
+    /// After the last words: waits for the others to close, but not for ever.
+    fn drain(&mut self, now: PhysicalTime, since: PhysicalTime) -> Poll {
+        let until = since.saturating_add(LAST_WORDS_MAX);
+        if now < until {
+            return Poll::Wait(Some(until));
+        }
+        self.phase = Phase::Ended;
+        Poll::Ended
+    }
+
+    /// Waits no longer than a sender's silent end may stay unexplained.
+    #[inline]
+    fn poll_until_explained(
+        &mut self,
+        now: PhysicalTime,
+        executor: &mut impl FederateExecutor,
+    ) -> Poll {
+        let poll = self.poll_running(now, executor);
+        match (poll, self.unexplained) {
+            (Poll::Wait(until), Some((_, explained))) => {
+                Poll::Wait(Some(until.map_or(explained, |until| until.min(explained))))
+            }
+            (poll, _) => poll,
         }
     }
 
@@ -325,7 +448,12 @@ impl Federate {
                     Progress::Blocked => {
                         // Others may wait for what has become certain since, before they tell what we wait for.
                         self.send_absents();
-                        return Poll::Wait(None);
+                        if !self.is_decentralized() {
+                            return Poll::Wait(None);
+                        }
+                        if let Some(next) = self.decide_absent(now) {
+                            return Poll::Wait(Some(next));
+                        }
                     }
                     // Begun ahead: all inputs have spoken, but others may still count on this tag being open.
                     Progress::TagDone if self.is_ahead() => return Poll::Wait(None),
@@ -336,9 +464,22 @@ impl Federate {
                 return Poll::Ended;
             } else if self.timeline.finished() {
                 return self.leave();
+            } else if self.cut_off(now) {
+                return Poll::Ended;
             } else if let Err(poll) = self.enter_next(now, executor) {
                 return poll;
             }
+        }
+    }
+
+    /// Whether a sender is gone and nobody has said why in time.
+    fn cut_off(&mut self, now: PhysicalTime) -> bool {
+        match self.unexplained {
+            Some((peer, until)) if now >= until => {
+                self.end_with(Outcome::PeerCut(peer));
+                true
+            }
+            Some(_) | None => false,
         }
     }
 
@@ -371,6 +512,7 @@ impl Federate {
             self.timeline.begin(next, &mut self.present);
         }
         executor.begin(self.timeline.at());
+        self.note_begun(now);
         let program = self.timeline.program();
         for (action, value) in &self.present {
             executor.arrive(*action, program.action_slot(*action), *value);
@@ -381,6 +523,17 @@ impl Federate {
         }
         self.send_absents();
         Ok(())
+    }
+
+    /// Notes the lag of the tag just begun, and what time has decided about its inputs.
+    fn note_begun(&mut self, now: PhysicalTime) {
+        if !self.config.fast {
+            let news = self.measures.tag_begun(now, self.timeline.at());
+            self.events.extend(news.map(FederateEvent::Lag));
+        }
+        if self.is_decentralized() {
+            self.decide_absent(now);
+        }
     }
 
     /// The next tag to execute, unless a stop in progress bars it.
@@ -396,6 +549,11 @@ impl Federate {
     /// Asks the clock and the link whether `next` may be entered; the answer may be a tag, because starving gives one.
     #[inline]
     fn permit(&mut self, now: PhysicalTime, next: Tag) -> Result<Tag, Poll> {
+        if self.is_decentralized() {
+            let next = self.permit_by_time(now, next)?;
+            self.wait_until_due(now, next)?;
+            return Ok(next);
+        }
         if let Some(link) = &mut self.link {
             let promise = match self.physical_delay {
                 // Nothing from outside can come before the start.
@@ -453,6 +611,7 @@ impl Federate {
             self.events.push_back(FederateEvent::Running);
         }
         self.counters.tags += 1;
+        self.measures.tag_completed();
         if let Some(link) = &mut self.link {
             link.completed(tag, network_inputs_ran);
         }
@@ -466,11 +625,17 @@ impl Federate {
         let tag = self.timeline.at();
         if self.link.is_none() {
             self.run_tag(tag, &mut batch, executor);
+        } else if self.timeline.any_tardy() {
+            // What a tardy node triggers is tardy too: each is finished by itself.
+            for node in &batch {
+                self.run_node(*node, tag, executor);
+                self.finish(&[*node], executor);
+            }
         } else {
             for node in &batch {
                 self.run_node(*node, tag, executor);
             }
-            self.finish(&batch);
+            self.finish(&batch, executor);
         }
         self.batch = batch;
     }
@@ -483,9 +648,7 @@ impl Federate {
                 executor.run(*node, tag, &mut self.effects);
             }
             self.timeline.finish(batch, &mut self.effects);
-            if std::mem::take(&mut self.effects.stop) {
-                self.request_stop_at_current();
-            }
+            self.take_effects(executor);
             batch.clear();
             match self.timeline.ready(batch) {
                 Progress::Batch => {}
@@ -501,28 +664,61 @@ impl Federate {
         self.counters.reactions += 1;
         match self.timeline.program().node(node) {
             NodeKind::Send { output } => self.send(node, output, executor),
-            NodeKind::Reaction | NodeKind::Forward { .. } => {
-                executor.run(node, tag, &mut self.effects);
-            }
+            NodeKind::Reaction | NodeKind::Forward { .. } => match self.timeline.tardy(node) {
+                None => executor.run(node, tag, &mut self.effects),
+                Some(intended) => executor.run_tardy(node, tag, intended, &mut self.effects),
+            },
         }
     }
 
     /// Takes the effects of nodes that are done.
     #[inline]
-    pub fn finish(&mut self, nodes: &[NodeId]) {
+    pub fn finish(&mut self, nodes: &[NodeId], executor: &mut impl FederateExecutor) {
         self.timeline.finish(nodes, &mut self.effects);
+        self.take_effects(executor);
+        self.send_absents();
+    }
+
+    /// What the timeline leaves: values set over physical connections of this program, and the wish to stop.
+    #[inline]
+    fn take_effects(&mut self, executor: &mut impl FederateExecutor) {
+        if !self.effects.physical.is_empty() {
+            let mut physical = std::mem::take(&mut self.effects.physical);
+            for (action, value) in physical.drain(..) {
+                let tag = self.schedule_physical(self.now, action, value);
+                executor.note_physical(action, tag);
+            }
+            self.effects.physical = physical;
+        }
         if std::mem::take(&mut self.effects.stop) {
             self.request_stop_at_current();
         }
-        self.send_absents();
     }
 
     fn send(&mut self, node: NodeId, output: OutputId, executor: &mut impl FederateExecutor) {
         let Some(link) = &mut self.link else { return };
-        if link.send(node, output, &self.timeline, |out| {
+        let sent = link.send(node, output, &self.timeline, |out| {
             executor.encode(output, out);
-        }) {
-            self.counters.sent += 1;
+        });
+        let Some(bytes) = sent else { return };
+        self.counters.sent += 1;
+        let receiver = link.config.outputs[output.index()].federate;
+        self.measures.sent(receiver, bytes);
+        if !self.config.fast {
+            self.launches.push((receiver, self.timeline.at().time));
+        }
+    }
+
+    /// Notes how long after it may have been begun the last messages left: the driver has written them, or is about to.
+    #[inline]
+    fn launch(&mut self, now: PhysicalTime) {
+        if self.launches.is_empty() {
+            return;
+        }
+        let offset = self.link.as_ref().map_or(Duration::ZERO, |link| link.config.stp_offset);
+        for (receiver, time) in self.launches.drain(..) {
+            let due = time.as_physical().saturating_add(offset);
+            self.measures.launch_lag(receiver, now.since(due));
         }
     }
 
@@ -554,6 +750,10 @@ impl Federate {
         executor: &mut impl FederateExecutor,
     ) -> Result<(), Outcome> {
         self.counters.received += 1;
+        if let Some(link) = &self.link {
+            let upstream = link.config.inputs[message.input.index()].federate;
+            self.measures.arrived(upstream, message.payload.len());
+        }
         if self.stop.over(self.timeline.at()) {
             return Ok(());
         }

@@ -51,9 +51,35 @@ pub enum Mutant {
     AheadCompletes,
     /// Federate: the stop tag is answered as asked, though it has passed.
     StopReplyTooEarly,
+    /// Decentralized: a tag is begun at its time, whatever may still come.
+    EntersEarly,
+    /// Decentralized: an input is taken for absent at its tag's time.
+    DecidesEarly,
+    /// Decentralized: absence is decided by the clock without looking at what has come.
+    DecidesUnlooked,
+    /// Decentralized: a message says nothing about earlier tags on its connection.
+    OrderIgnored,
+    /// Decentralized: STP violations are not counted.
+    TardyUncounted,
+    /// Decentralized: the end of a lost sender's stream is taken for its regular end.
+    LossAsEnd,
 }
 
 impl Mutant {
+    /// Whether it is a rule of decentralized coordination.
+    #[must_use]
+    pub const fn is_of_time(self) -> bool {
+        matches!(
+            self,
+            Self::EntersEarly
+                | Self::DecidesEarly
+                | Self::DecidesUnlooked
+                | Self::OrderIgnored
+                | Self::TardyUncounted
+                | Self::LossAsEnd
+        )
+    }
+
     /// All of them.
     pub const ALL: &[Self] = &[
         Self::EimtNotStrict,
@@ -79,6 +105,12 @@ impl Mutant {
         Self::AbsentsDropped,
         Self::AheadCompletes,
         Self::StopReplyTooEarly,
+        Self::EntersEarly,
+        Self::DecidesEarly,
+        Self::DecidesUnlooked,
+        Self::OrderIgnored,
+        Self::TardyUncounted,
+        Self::LossAsEnd,
     ];
 }
 

@@ -1,6 +1,6 @@
 //! What coordination asks of an executor beyond running nodes: bytes.
 
-use ictus_core::{Executor, InputId, OutputId, ValueId};
+use ictus_core::{ActionId, Executor, InputId, OutputId, Tag, ValueId};
 use thiserror::Error;
 
 /// A message whose bytes are not a value of the input's type. Fatal for the federation: sender and receiver disagree.
@@ -28,4 +28,14 @@ pub trait FederateExecutor: Executor {
     ///
     /// [`PayloadError`] when the bytes are not a value of the input's type.
     fn decode(&mut self, input: InputId, payload: &[u8]) -> Result<ValueId, PayloadError>;
+
+    /// Notes that an event from outside, or a message on a physical connection, got `tag`.
+    fn note_physical(&mut self, action: ActionId, tag: Tag) {
+        let _ = (action, tag);
+    }
+
+    /// Notes that a message for `input` came after the input had been decided at `intended`: it is handled at `actual`.
+    fn note_tardy(&mut self, input: InputId, intended: Tag, actual: Tag) {
+        let _ = (input, intended, actual);
+    }
 }

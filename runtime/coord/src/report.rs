@@ -20,6 +20,8 @@ pub mod exit {
     pub const PEER_FAILED: u8 = 11;
     /// The RTI refused the join, or could not be reached in time.
     pub const NOT_JOINED: u8 = 12;
+    /// Stopped the federation after as many STP violations as the plan allows.
+    pub const STP_VIOLATIONS: u8 = 14;
     /// Wrong command line.
     pub const USAGE: u8 = 64;
 }

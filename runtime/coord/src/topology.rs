@@ -100,7 +100,7 @@ impl Topology {
     /// The topology of a plan's connections between different federates.
     #[must_use]
     pub fn of_plan(plan: &Plan) -> Self {
-        let remote = |c: &&ConnectionPlan| c.from.federate != c.to.federate;
+        let remote = |c: &&ConnectionPlan| c.from.federate != c.to.federate && !c.physical;
         Self::new(
             plan.federates.len(),
             plan.connections.iter().filter(remote).map(|c| {
@@ -282,6 +282,7 @@ pub fn zero_delay_cycle_inputs(
         .enumerate()
         .filter(|(_, connection)| {
             connection.to.federate == federate.get()
+                && !connection.physical
                 && connection_delay(connection) == Delay::None
                 && topology.share_zero_delay_cycle(FederateId(connection.from.federate), federate)
         })

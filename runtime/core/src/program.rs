@@ -781,6 +781,14 @@ impl Program {
         false
     }
 
+    /// Whether a message on `input` makes a reaction run.
+    #[must_use]
+    pub fn triggers_reaction(&self, input: InputId) -> bool {
+        let triggered = &self.action_triggers[self.inputs[input.index()].action.index()];
+        let reaction = |node: &NodeId| self.nodes[node.index()] == NodeKind::Reaction;
+        triggered.iter().any(reaction)
+    }
+
     /// The least minimum delay over all physical actions and connections, or `None` when there is none: what comes from
     /// outside never gets a tag before physical time plus this.
     #[must_use]

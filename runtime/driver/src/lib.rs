@@ -247,6 +247,7 @@ pub mod describe;
 mod linker;
 mod observe;
 mod outside;
+mod peers;
 mod parameters;
 mod port;
 mod reactor;

@@ -10,10 +10,12 @@ use crate::class::Class;
 use crate::clock::{Clock, SystemClock};
 use crate::observe::Observation;
 use crate::outside::OutsideEvent;
+use crate::peers::Peers;
 use crate::status::Status;
-use crate::transport::{self, Connection, Signals, Waker};
+use crate::transport::{self, Awaited, Connection, Signals, Waker};
 use ictus_coord::federate::{Federate, FederateConfig, FederateEvent, LinkConfig, Outcome, Poll};
 use ictus_coord::plan::Plan;
+use ictus_coord::measure::LagNews;
 use ictus_coord::report::{FederateStatus, exit};
 use ictus_core::{Duration, PhysicalTime, Tag};
 use std::io::{self, Write};
@@ -226,6 +228,7 @@ fn run_one(job: &Job<'_>, ids: &[u16], rti: Option<SocketAddr>) -> Result<u8, Ru
     let runner = Runner {
         io: Io {
             connection,
+            peers: Peers::default(),
             waker: Waker::new().map_err(RunError::Io)?,
             signals: Signals::new().map_err(RunError::Io)?,
         },
@@ -267,6 +270,7 @@ fn connect(address: SocketAddr) -> Result<Connection, RunError> {
 #[derive(Debug)]
 struct Io {
     connection: Option<Connection>,
+    peers: Peers,
     waker: Waker,
     signals: Signals,
 }
@@ -294,6 +298,7 @@ impl Runner<'_> {
             .outside()
             .on_event(Box::new(move || waker.wake()));
         let mut now = self.clock.now();
+        self.listen()?;
         self.federate.connect();
         if self.io.connection.is_none() {
             self.federate.start(Tag::new(now.as_logical(), 0));
@@ -322,6 +327,8 @@ impl Runner<'_> {
                     self.wait(now, until)?;
                     now = self.clock.now();
                     self.look(now);
+                    // The clock may just have been corrected.
+                    now = self.clock.now();
                 }
                 Poll::Ended => break,
             }
@@ -330,20 +337,26 @@ impl Runner<'_> {
         self.leave()
     }
 
+    /// Listens for other federates at the address by which this host reaches the RTI.
+    fn listen(&mut self) -> Result<(), RunError> {
+        if let Some(connection) = &self.io.connection {
+            let here = connection.local().map_err(RunError::Io)?;
+            let peers = &mut self.io.peers;
+            peers.listen(here.ip(), &mut self.federate).map_err(RunError::Io)?;
+        }
+        Ok(())
+    }
+
     #[inline]
     fn execute(&mut self, now: PhysicalTime) -> Result<(), RunError> {
         self.federate.run_batch(&mut self.bodies);
         if self.bodies.fault().is_some() {
             self.federate.fail();
         }
-        let pending = self.federate.output().map_or(0, |out| out.len());
+        let pending = self.pending();
         if pending > FLUSH_BYTES || (pending > 0 && now.since(self.written_at) > FLUSH_AGE) {
             self.write(now);
-            while self
-                .federate
-                .output()
-                .is_some_and(|out| out.len() > BACKLOG_BYTES)
-            {
+            while self.pending() > BACKLOG_BYTES {
                 self.wait(now, None)?;
                 let now = self.clock.now();
                 self.look(now);
@@ -353,12 +366,23 @@ impl Runner<'_> {
         Ok(())
     }
 
+    /// Bytes that wait to be written, of the fullest connection.
+    #[inline]
+    fn pending(&mut self) -> usize {
+        let rti = self.federate.output().map_or(0, |out| out.len());
+        if self.io.peers.is_empty() {
+            return rti;
+        }
+        rti.max(self.io.peers.backlog(&mut self.federate))
+    }
+
     /// Everything that came from outside: bytes, events, signals; then what the federate wants known.
     fn look(&mut self, now: PhysicalTime) {
+        let mut drained = true;
         if let Some(connection) = &mut self.io.connection
             && !connection.closed()
         {
-            connection.read();
+            drained = connection.read();
             let used = self
                 .federate
                 .receive(now, connection.bytes(), &mut self.bodies);
@@ -366,6 +390,14 @@ impl Runner<'_> {
             if connection.closed() {
                 self.federate.handle_disconnect();
             }
+        }
+        if !self.io.peers.is_empty() {
+            let Io { peers, .. } = &mut self.io;
+            drained &= peers.read(now, &mut self.federate, &mut self.bodies);
+            peers.tidy(&self.federate);
+        }
+        if drained {
+            self.federate.looked(now);
         }
         self.bodies.drain_outside(&mut self.outside);
         for event in self.outside.drain(..) {
@@ -388,17 +420,29 @@ impl Runner<'_> {
             .then(|| self.reported_at + PROGRESS_EVERY);
         let until = until.into_iter().chain(progress).min();
         let timeout = until.map(|until| until.since(self.clock.now()));
-        let Io {
-            connection,
-            waker,
-            signals,
-        } = &mut self.io;
-        let woken = transport::wait(connection.as_ref(), wants_write, waker, signals, timeout)
-            .map_err(RunError::Io)?;
-        if woken.signal {
+        if self.sleep(wants_write, timeout)? {
             self.take_signals()?;
         }
         Ok(())
+    }
+
+    /// Waits for anything; says whether a signal came.
+    fn sleep(&mut self, wants_write: bool, timeout: Option<Duration>) -> Result<bool, RunError> {
+        let Io {
+            connection,
+            peers,
+            waker,
+            signals,
+        } = &self.io;
+        let rti = connection.iter();
+        let rti = rti.map(|connection| Awaited::Connection(connection, wants_write));
+        let signal = if peers.is_empty() {
+            transport::wait(rti, waker, signals, timeout)
+        } else {
+            let peers = peers.awaited(&mut self.federate);
+            transport::wait(rti.chain(peers), waker, signals, timeout)
+        };
+        signal.map_err(RunError::Io)
     }
 
     fn take_signals(&mut self) -> Result<(), RunError> {
@@ -419,6 +463,9 @@ impl Runner<'_> {
         {
             connection.write(out);
         }
+        if !self.io.peers.is_empty() {
+            self.io.peers.write(&mut self.federate);
+        }
     }
 
     fn events(&mut self) {
@@ -437,6 +484,38 @@ impl Runner<'_> {
                 FederateEvent::Running => self.status.say(&FederateStatus::Running { federate }),
                 FederateEvent::StopGranted(tag) => self.bodies.note_stop(tag),
                 FederateEvent::StopRequested | FederateEvent::PeerLost(_) => {}
+                FederateEvent::Connect {
+                    peer,
+                    address,
+                    port,
+                } => {
+                    let now = self.clock.now();
+                    let peers = &mut self.io.peers;
+                    peers.connect(&mut self.federate, now, peer, (address, port));
+                }
+                FederateEvent::PeerRefused(words) => {
+                    drop(writeln!(io::stderr(), "ictus: federate {federate}: {words}"));
+                }
+                FederateEvent::StpViolation {
+                    upstream,
+                    lateness,
+                    count,
+                } => self.status.say(&FederateStatus::StpViolation {
+                    federate,
+                    upstream,
+                    lateness_ns: lateness.as_nanos(),
+                    count,
+                }),
+                FederateEvent::Lag(LagNews::FallingBehind { lag }) => {
+                    let lag_ns = lag.as_nanos();
+                    let status = FederateStatus::FallingBehind { federate, lag_ns };
+                    self.status.say(&status);
+                }
+                FederateEvent::Lag(LagNews::CaughtUp { lag }) => {
+                    let lag_ns = lag.as_nanos();
+                    self.status
+                        .say(&FederateStatus::CaughtUp { federate, lag_ns });
+                }
             }
         }
     }
@@ -506,32 +585,26 @@ impl Runner<'_> {
             let now = self.clock.now();
             self.write(now);
             let empty = self.federate.output().is_none_or(|out| out.is_empty());
+            let peers_empty = self.io.peers.backlog(&mut self.federate) == 0;
             let Some(connection) = &mut self.io.connection else {
                 return Ok(());
             };
-            if empty && !finished {
+            // Last: who reads what was sent to it may still need the RTI to count this federate as here.
+            if empty && peers_empty && !finished {
                 connection.finish();
                 finished = true;
             }
             connection.read();
             let count = connection.bytes().len();
             connection.take(count);
-            if connection.closed() || now > until {
+            let closed = connection.closed();
+            let Io { peers, .. } = &mut self.io;
+            peers.read(now, &mut self.federate, &mut self.bodies);
+            peers.tidy(&self.federate);
+            if (closed && peers_empty) || now > until {
                 return Ok(());
             }
-            let Io {
-                connection,
-                waker,
-                signals,
-            } = &self.io;
-            transport::wait(
-                connection.as_ref(),
-                !empty,
-                waker,
-                signals,
-                Some(until.since(now)),
-            )
-            .map_err(RunError::Io)?;
+            self.sleep(!empty, Some(until.since(now)))?;
         }
     }
 
@@ -562,8 +635,13 @@ impl Runner<'_> {
                 (exit::RTI_LOST, format!("{outcome}{rti}"))
             }
             Some(outcome @ Outcome::RtiFailed) => (exit::PEER_FAILED, outcome.to_string()),
-            Some(outcome @ (Outcome::Rejected(_) | Outcome::NotJoined { .. })) => {
-                (exit::NOT_JOINED, outcome.to_string())
+            Some(
+                outcome @ (Outcome::Rejected(_)
+                | Outcome::NotJoined { .. }
+                | Outcome::RejectedByPeer { .. }),
+            ) => (exit::NOT_JOINED, outcome.to_string()),
+            Some(outcome @ Outcome::TooManyViolations(_)) => {
+                (exit::STP_VIOLATIONS, outcome.to_string())
             }
             Some(outcome) => (exit::FAILED, outcome.to_string()),
         }

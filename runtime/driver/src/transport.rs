@@ -5,7 +5,7 @@ use rustix::event::{EventfdFlags, PollFd, PollFlags, Timespec, eventfd, poll};
 use rustix::io::Errno;
 use rustix::net::sockopt;
 use std::io::{self, ErrorKind, Read, Write};
-use std::net::{Shutdown, SocketAddr, TcpStream};
+use std::net::{Shutdown, SocketAddr, TcpListener, TcpStream};
 use std::os::fd::{AsFd, OwnedFd};
 use std::os::unix::net::UnixStream;
 use std::sync::Arc;
@@ -34,12 +34,16 @@ pub(crate) struct Connection {
 impl Connection {
     /// Connects once, with Nagle off: what is written is already a batch.
     pub(crate) fn open(address: SocketAddr, timeout: Duration) -> io::Result<Self> {
-        let stream = TcpStream::connect_timeout(&address, timeout.to_std())?;
+        Self::of(TcpStream::connect_timeout(&address, timeout.to_std())?, address)
+    }
+
+    /// A connection that stands.
+    pub(crate) fn of(stream: TcpStream, peer: SocketAddr) -> io::Result<Self> {
         stream.set_nodelay(true)?;
         stream.set_nonblocking(true)?;
         notice_a_dead_host(&stream)?;
         Ok(Self {
-            peer: address,
+            peer,
             stream,
             buffer: vec![0; READ_BYTES],
             filled: 0,
@@ -48,8 +52,8 @@ impl Connection {
         })
     }
 
-    /// Reads what is there; after the end of the stream [`Connection::closed`] is true.
-    pub(crate) fn read(&mut self) {
+    /// Reads what is there and says whether that was all; after the end of the stream [`Connection::closed`] is true.
+    pub(crate) fn read(&mut self) -> bool {
         if self.taken == self.filled {
             (self.taken, self.filled) = (0, 0);
         } else if self.taken > 0 && self.buffer.len() - self.filled < READ_BYTES / 2 {
@@ -61,12 +65,16 @@ impl Connection {
         }
         match self.stream.read(&mut self.buffer[self.filled..]) {
             Ok(0) => self.closed = true,
-            Ok(count) => self.filled += count,
-            Err(error)
-                if matches!(error.kind(), ErrorKind::WouldBlock | ErrorKind::Interrupted) => {}
+            Ok(count) => {
+                self.filled += count;
+                return self.filled < self.buffer.len();
+            }
+            Err(error) if error.kind() == ErrorKind::WouldBlock => {}
+            Err(error) if error.kind() == ErrorKind::Interrupted => return false,
             // A reset ends the stream like a close, after what was received is processed.
             Err(_) => self.closed = true,
         }
+        true
     }
 
     /// The bytes received and not taken.
@@ -96,6 +104,11 @@ impl Connection {
             }
         }
         out.drain(..written);
+    }
+
+    /// The address at this end.
+    pub(crate) fn local(&self) -> io::Result<SocketAddr> {
+        self.stream.local_addr()
     }
 
     /// The peer's address.
@@ -177,25 +190,46 @@ impl Signals {
     }
 }
 
-/// What ended a wait.
-#[derive(Clone, Copy, Debug, Default)]
-pub(crate) struct Woken {
-    /// The connection has bytes, or its end.
-    pub(crate) readable: bool,
-    /// A signal came.
-    pub(crate) signal: bool,
+/// What a wait is for, besides events from outside and signals.
+#[derive(Clone, Copy, Debug)]
+pub(crate) enum Awaited<'a> {
+    /// Bytes of a peer, and if wanted room to write.
+    Connection(&'a Connection, bool),
+    /// Somebody who connects.
+    Listener(&'a TcpListener),
 }
 
-/// Waits for bytes, room to write, a wake-up, a signal, or until `timeout` is over (`None`: for ever).
+impl<'a> Awaited<'a> {
+    /// What to ask the kernel for; `None` when nothing can come.
+    fn poll_fd(self) -> Option<PollFd<'a>> {
+        match self {
+            // A peer that has only said its last word may still read.
+            Self::Connection(connection, wants_write) => {
+                let wanted = match (connection.closed, wants_write) {
+                    (true, false) => return None,
+                    (false, false) => PollFlags::IN,
+                    (false, true) => PollFlags::IN | PollFlags::OUT,
+                    (true, true) => PollFlags::OUT,
+                };
+                Some(PollFd::from_borrowed_fd(connection.stream.as_fd(), wanted))
+            }
+            Self::Listener(listener) => {
+                Some(PollFd::from_borrowed_fd(listener.as_fd(), PollFlags::IN))
+            }
+        }
+    }
+}
+
+/// Waits for bytes, room to write, a wake-up, a signal, or until `timeout` is over (`None`: for ever); says whether a signal
+/// came.
 ///
 /// The time-out has nanosecond resolution; [`precise_waits`] makes the kernel honour it.
-pub(crate) fn wait(
-    connection: Option<&Connection>,
-    wants_write: bool,
-    waker: &Waker,
-    signals: &Signals,
+pub(crate) fn wait<'a>(
+    awaited: impl Iterator<Item = Awaited<'a>>,
+    waker: &'a Waker,
+    signals: &'a Signals,
     timeout: Option<Duration>,
-) -> io::Result<Woken> {
+) -> io::Result<bool> {
     let timeout = timeout.map(|t| {
         let nanos = t.as_nanos().max(0);
         Timespec {
@@ -203,41 +237,17 @@ pub(crate) fn wait(
             tv_nsec: nanos % 1_000_000_000,
         }
     });
-    let base = [
-        PollFd::from_borrowed_fd(waker.0.as_fd(), PollFlags::IN),
-        PollFd::from_borrowed_fd(signals.stream.as_fd(), PollFlags::IN),
-    ];
-    let [waker_fd, signals_fd] = base;
-    let result;
-    let mut woken = Woken::default();
-    // A peer that has only said its last word may still read.
-    match connection.filter(|c| !c.closed || wants_write) {
-        Some(connection) => {
-            let wanted = match (connection.closed, wants_write) {
-                (false, false) => PollFlags::IN,
-                (false, true) => PollFlags::IN | PollFlags::OUT,
-                (true, _) => PollFlags::OUT,
-            };
-            let stream = PollFd::from_borrowed_fd(connection.stream.as_fd(), wanted);
-            let mut fds = [waker_fd, signals_fd, stream];
-            result = poll(&mut fds, timeout.as_ref());
-            let ready = PollFlags::IN | PollFlags::HUP | PollFlags::ERR;
-            woken.readable = fds[2].revents().intersects(ready);
-            woken.signal = !fds[1].revents().is_empty();
-        }
-        None => {
-            let mut fds = [waker_fd, signals_fd];
-            result = poll(&mut fds, timeout.as_ref());
-            woken.signal = !fds[1].revents().is_empty();
-        }
-    }
-    match result {
-        Ok(_) => {}
-        Err(Errno::INTR) => woken.signal = true,
+    let mut fds = Vec::with_capacity(4);
+    fds.push(PollFd::from_borrowed_fd(waker.0.as_fd(), PollFlags::IN));
+    fds.push(PollFd::from_borrowed_fd(signals.stream.as_fd(), PollFlags::IN));
+    fds.extend(awaited.filter_map(Awaited::poll_fd));
+    let signal = match poll(&mut fds, timeout.as_ref()) {
+        Ok(_) => !fds[1].revents().is_empty(),
+        Err(Errno::INTR) => true,
         Err(errno) => return Err(errno.into()),
-    }
+    };
     waker.clear();
-    Ok(woken)
+    Ok(signal)
 }
 
 /// Makes this thread's waits end at their time: timer slack of 1 ns instead of 50 us.
@@ -249,7 +259,6 @@ pub(crate) fn precise_waits() {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use std::net::TcpListener;
 
     #[test]
     fn a_peer_that_only_half_closed_gets_everything() {
@@ -260,7 +269,8 @@ mod tests {
         peer.shutdown(Shutdown::Write).unwrap();
         let (waker, signals) = (Waker::new().unwrap(), Signals::new().unwrap());
         while !connection.closed() {
-            wait(Some(&connection), false, &waker, &signals, None).unwrap();
+            let awaited = [Awaited::Connection(&connection, false)];
+            wait(awaited.into_iter(), &waker, &signals, None).unwrap();
             connection.read();
         }
         let sent = 32 << 20;
@@ -269,7 +279,8 @@ mod tests {
         assert!(!out.is_empty(), "more than the socket takes");
         let reader = std::thread::spawn(move || io::copy(&mut peer, &mut io::sink()).unwrap());
         while !out.is_empty() {
-            wait(Some(&connection), true, &waker, &signals, None).unwrap();
+            let awaited = [Awaited::Connection(&connection, true)];
+            wait(awaited.into_iter(), &waker, &signals, None).unwrap();
             connection.write(&mut out);
         }
         connection.finish();

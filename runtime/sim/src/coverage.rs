@@ -1,5 +1,6 @@
 //! What the runs have exercised: a feature that never happens is a feature that is not tested.
 
+use crate::scenario::Kind;
 use std::fmt::Write as _;
 
 macro_rules! features {
@@ -53,7 +54,34 @@ features! {
     LegacySource => "source that announces by LTC alone",
     Calm => "run in which nothing may be late",
     Fast => "run ahead of physical time",
+    Decentralized => "decentralized coordination",
+    StpViolation => "STP violation",
+    WithinBounds => "run with all messages within their bounds",
 }
+
+/// What only runs under decentralized coordination show.
+const OF_TIME: &[Feature] = &[
+    Feature::Decentralized,
+    Feature::StpViolation,
+    Feature::WithinBounds,
+];
+
+/// What both kinds of runs show.
+const EVERYWHERE: &[Feature] = &[
+    Feature::Absent,
+    Feature::MicrostepDelay,
+    Feature::TimeDelay,
+    Feature::Cycle,
+    Feature::PhysicalAction,
+    Feature::OutOfOrder,
+    Feature::StopByReaction,
+    Feature::StopFromOutside,
+    Feature::CrashWhileJoining,
+    Feature::Crash,
+    Feature::RtiCrash,
+    Feature::Partition,
+    Feature::ClockOffset,
+];
 
 /// Counts per feature.
 #[derive(Clone, Debug)]
@@ -93,11 +121,15 @@ impl Coverage {
         }
     }
 
-    /// The features that never happened.
-    pub fn missing(&self) -> impl Iterator<Item = &'static str> {
+    /// The features that runs of this kind must show and that never happened.
+    pub fn missing(&self, kind: Kind) -> impl Iterator<Item = &'static str> {
+        let wanted = move |feature: &Feature| match kind {
+            Kind::Centralized => !OF_TIME.contains(feature),
+            Kind::Decentralized => OF_TIME.contains(feature) || EVERYWHERE.contains(feature),
+        };
         Feature::ALL
             .iter()
-            .filter(|(feature, _)| self.count(*feature) == 0)
+            .filter(move |(feature, _)| wanted(feature) && self.count(*feature) == 0)
             .map(|(_, words)| *words)
     }
 

@@ -10,6 +10,7 @@ use ictus_core::{
     ActionId, Duration, Effects, Executor, InputId, NodeId, NodeKind, OutputId, PhysicalTime,
     Scheduled, SlotId, Tag, ValueId,
 };
+use std::collections::BTreeSet;
 
 /// What the simulated world asks of an executor beyond coordination.
 pub trait SimulatedExecutor: FederateExecutor {
@@ -32,6 +33,11 @@ pub trait SimulatedExecutor: FederateExecutor {
 
     /// Whether nothing has arrived at the current tag: a tag that is executed only because the RTI wants to know.
     fn quiet(&self) -> bool;
+
+    /// Whether a reaction ran as tardy at `tag`.
+    fn ran_tardy(&self, _tag: Tag) -> bool {
+        true
+    }
 
     /// Takes note of what `node` reads when it starts; when it runs, later, it must read the same.
     fn observe(&mut self, node: NodeId);
@@ -73,6 +79,8 @@ pub struct SyntheticExecutor {
     free: Vec<usize>,
     observed: Vec<Option<u64>>,
     trace: Vec<Record>,
+    /// The tags at which reactions ran as tardy.
+    tardy: BTreeSet<Tag>,
     /// The stop tag's records of shutdown reactions are told apart.
     unstable: Option<NodeId>,
     payload: usize,
@@ -99,6 +107,7 @@ impl SyntheticExecutor {
             free: Vec::new(),
             observed: vec![None; nodes],
             trace: Vec::new(),
+            tardy: BTreeSet::new(),
             unstable: None,
             payload,
             arrivals: 0,
@@ -296,6 +305,11 @@ impl Executor for SyntheticExecutor {
         }
     }
 
+    fn run_tardy(&mut self, node: NodeId, tag: Tag, _intended: Tag, effects: &mut Effects) {
+        self.tardy.insert(tag);
+        self.run(node, tag, effects);
+    }
+
     fn run(&mut self, node: NodeId, _tag: Tag, effects: &mut Effects) {
         self.check_stable(node);
         match self.assembly.program.node(node) {
@@ -358,6 +372,10 @@ impl SimulatedExecutor for SyntheticExecutor {
 
     fn quiet(&self) -> bool {
         self.arrivals == 0
+    }
+
+    fn ran_tardy(&self, tag: Tag) -> bool {
+        self.tardy.contains(&tag)
     }
 
     fn observe(&mut self, node: NodeId) {

@@ -5,6 +5,7 @@ pub mod coverage;
 pub mod executor;
 pub mod network;
 pub mod observer;
+pub mod offsets;
 pub mod plan;
 pub mod program;
 pub mod reference;

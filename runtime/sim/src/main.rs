@@ -1,4 +1,4 @@
-//! `cargo sim --seeds N [--seed 0x51f3]... [--dump] [--mutants]`: checks seeds, prints what they showed.
+//! `cargo sim --seeds N [--seed 0x51f3]... [--decentralized] [--dump] [--mutants]`: checks seeds, prints what they showed.
 
 use std::io::{self, Write};
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -8,7 +8,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use ictus_coord::mutants::Mutants;
 use ictus_sim::coverage::Coverage;
 use ictus_sim::observer::Violation;
-use ictus_sim::scenario::{Verdict, check_seed_logged, describe};
+use ictus_sim::scenario::{Kind, Verdict, check_seed_logged, describe};
 
 /// Threads that check seeds.
 const THREADS: u64 = 2;
@@ -22,6 +22,7 @@ struct Options {
     single: Vec<u64>,
     mutants: bool,
     dump: bool,
+    kind: Kind,
 }
 
 fn main() -> ExitCode {
@@ -32,7 +33,7 @@ fn main() -> ExitCode {
             Ok(false) | Err(_) => ExitCode::FAILURE,
         },
         Err(words) => {
-            let usage = "cargo sim [--seeds N] [--from N] [--seed 0xN]... [--dump] [--mutants]";
+            let usage = "cargo sim [--seeds N] [--from N] [--seed 0xN]... [--decentralized] [--dump] [--mutants]";
             drop(writeln!(io::stderr(), "{words}\nusage: {usage}"));
             ExitCode::from(2)
         }
@@ -46,6 +47,7 @@ fn parse(arguments: impl Iterator<Item = String>) -> Result<Options, String> {
         single: Vec::new(),
         mutants: false,
         dump: false,
+        kind: Kind::Centralized,
     };
     let mut arguments = arguments.peekable();
     while let Some(argument) = arguments.next() {
@@ -63,6 +65,7 @@ fn parse(arguments: impl Iterator<Item = String>) -> Result<Options, String> {
             "--seed" => options.single.push(number()?),
             "--mutants" => options.mutants = true,
             "--dump" => options.dump = true,
+            "--decentralized" => options.kind = Kind::Decentralized,
             "--" => {}
             _ => return Err(format!("unknown argument {argument}")),
         }
@@ -74,9 +77,9 @@ fn run(options: &Options, out: &mut impl Write) -> io::Result<bool> {
     let mut good = true;
     for seed in &options.single {
         if options.dump {
-            writeln!(out, "{}", describe(*seed))?;
+            writeln!(out, "{}", describe(*seed, options.kind))?;
         }
-        let (verdict, violation) = check(*seed, Mutants::NONE, options.dump);
+        let (verdict, violation) = check(*seed, options.kind, Mutants::NONE, options.dump);
         if let Some(verdict) = verdict {
             write!(out, "{}", verdict.log.as_deref().unwrap_or_default())?;
             writeln!(
@@ -101,8 +104,13 @@ fn run(options: &Options, out: &mut impl Write) -> io::Result<bool> {
 }
 
 /// Checks one seed; a panic is a violation too.
-fn check(seed: u64, mutants: Mutants, log: bool) -> (Option<Verdict>, Option<Violation>) {
-    match catch_unwind(AssertUnwindSafe(|| check_seed_logged(seed, mutants, log))) {
+fn check(
+    seed: u64,
+    kind: Kind,
+    mutants: Mutants,
+    log: bool,
+) -> (Option<Verdict>, Option<Violation>) {
+    match catch_unwind(AssertUnwindSafe(|| check_seed_logged(seed, kind, mutants, log))) {
         Ok(verdict) => {
             let violation = verdict.violation.clone();
             (Some(verdict), violation)
@@ -128,8 +136,8 @@ struct Tally {
 }
 
 impl Tally {
-    fn take(&mut self, seed: u64) {
-        let (verdict, violation) = check(seed, Mutants::NONE, false);
+    fn take(&mut self, seed: u64, kind: Kind) {
+        let (verdict, violation) = check(seed, kind, Mutants::NONE, false);
         if let Some(violation) = violation {
             let options = verdict.as_ref().map(|v| format!("{:?}", v.swarm));
             let options = options.unwrap_or_default();
@@ -138,7 +146,7 @@ impl Tally {
         }
         let Some(verdict) = verdict else { return };
         if seed.is_multiple_of(TWICE)
-            && check_seed_logged(seed, Mutants::NONE, false).hash != verdict.hash
+            && check_seed_logged(seed, kind, Mutants::NONE, false).hash != verdict.hash
         {
             let what = "the same seed gave two different runs".to_owned();
             self.failures.push((seed, what));
@@ -169,7 +177,7 @@ fn run_seeds(options: &Options, out: &mut impl Write) -> io::Result<bool> {
                 if seed >= end || tally.failures.len() > 20 {
                     return tally;
                 }
-                tally.take(seed);
+                tally.take(seed, options.kind);
             }
         };
         let workers: Vec<_> = (0..THREADS).map(|_| scope.spawn(work)).collect();
@@ -183,10 +191,10 @@ fn run_seeds(options: &Options, out: &mut impl Write) -> io::Result<bool> {
     for tally in tallies {
         total.merge(tally);
     }
-    report(&mut total, out)
+    report(&mut total, options.kind, out)
 }
 
-fn report(total: &mut Tally, out: &mut impl Write) -> io::Result<bool> {
+fn report(total: &mut Tally, kind: Kind, out: &mut impl Write) -> io::Result<bool> {
     total.tags.sort_unstable();
     total.federates.sort_unstable();
     total.failures.sort_unstable();
@@ -204,9 +212,13 @@ fn report(total: &mut Tally, out: &mut impl Write) -> io::Result<bool> {
     )?;
     write!(out, "{}", total.coverage.table())?;
     for (seed, what) in &total.failures {
-        writeln!(out, "reproduce: cargo sim --seed {seed:#x}\n  {what}")?;
+        let option = match kind {
+            Kind::Centralized => "",
+            Kind::Decentralized => " --decentralized",
+        };
+        writeln!(out, "reproduce: cargo sim{option} --seed {seed:#x}\n  {what}")?;
     }
-    let missing: Vec<_> = total.coverage.missing().collect();
+    let missing: Vec<_> = total.coverage.missing(kind).collect();
     // A handful of seeds cannot show everything.
     let enough = total.tags.len() < 1_000 || missing.is_empty();
     if !enough {

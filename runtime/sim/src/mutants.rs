@@ -2,6 +2,7 @@
 
 use super::{Options, check};
 use ictus_coord::mutants::{Mutant, Mutants};
+use ictus_sim::scenario::Kind;
 use std::io::{self, Write};
 use std::sync::atomic::{AtomicU64, Ordering};
 
@@ -64,7 +65,12 @@ pub(super) fn run(options: &Options, out: &mut impl Write) -> io::Result<bool> {
 
 fn hunt(mutant: Mutant, seeds: u64) -> Option<(u64, String)> {
     (1..=seeds).find_map(|seed| {
-        let (_, violation) = check(seed, Mutants::only(mutant), false);
+        let kind = if mutant.is_of_time() {
+            Kind::Decentralized
+        } else {
+            Kind::Centralized
+        };
+        let (_, violation) = check(seed, kind, Mutants::only(mutant), false);
         violation.map(|violation| {
             let words: String = violation.to_string().chars().take(110).collect();
             (seed, words)

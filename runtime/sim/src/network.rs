@@ -87,6 +87,12 @@ impl Pipe {
         self.closed = true;
     }
 
+    /// When the next thing arrives.
+    #[must_use]
+    pub fn next_at(&self) -> Option<i64> {
+        self.in_flight.front().map(|(at, _)| *at)
+    }
+
     /// What has arrived by `now`, in order.
     pub fn take(&mut self, now: i64) -> Option<Arrival> {
         match self.in_flight.front() {

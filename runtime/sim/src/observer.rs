@@ -1,9 +1,9 @@
 //! A separate observer of every byte between federates and the RTI. It knows the truth and trusts nobody.
 
 use crate::coverage::{Coverage, Feature};
-use ictus_coord::plan::Plan;
+use ictus_coord::plan::{Coordination, Plan, Wire};
 use ictus_coord::topology::{FederateId, Topology, connection_delay};
-use ictus_coord::wire::{TaggedMessage, ToFederate, ToRti};
+use ictus_coord::wire::{MAX_PAYLOAD, TaggedMessage, ToFederate, ToPeer, ToRti};
 use ictus_core::{Delay, Tag};
 use std::collections::BTreeMap;
 use thiserror::Error;
@@ -84,6 +84,8 @@ pub struct Observer {
     pub log: Option<String>,
     /// True time in nanoseconds, for the log.
     pub now: i64,
+    /// Whether clocks and offsets decide, not grants.
+    decentralized: bool,
     /// Whether events come from outside.
     pub physical: bool,
     /// Whether federates and RTI use our extensions.
@@ -114,6 +116,7 @@ impl Observer {
             violation: None,
             log: None,
             now: 0,
+            decentralized: plan.coordination == Coordination::Decentralized,
             physical: false,
             extensions: true,
             coverage: Coverage::default(),
@@ -246,6 +249,25 @@ impl Observer {
         *to.unrelayed.entry((message.tag, id)).or_default() += 1;
         if to.last_on_port.insert(message.port, message.tag) == Some(message.tag) {
             self.coverage.hit(Feature::Collision);
+        }
+    }
+
+    /// A federate has written these whole messages to another one.
+    pub fn peer_wrote(&mut self, from: usize, to: usize, mut bytes: &[u8]) {
+        while !bytes.is_empty() {
+            let Ok(Some((message, length))) = ToPeer::decode(bytes, Wire::V0_12, MAX_PAYLOAD)
+            else {
+                let what = format!("federate {from} wrote to {to} what is no message");
+                self.blame("safety", what);
+                return;
+            };
+            bytes = &bytes[length..];
+            self.note(from, &format!("=> {to}"), &message);
+            match message {
+                ToPeer::TaggedMessage(message) => self.message_sent(from, &message),
+                ToPeer::PortAbsent(_) => self.coverage.hit(Feature::Absent),
+                ToPeer::Hello { .. } | ToPeer::Message(_) => {}
+            }
         }
     }
 
@@ -488,6 +510,9 @@ impl Observer {
     pub fn federate_ran(&mut self, federate: usize, position: Position) {
         if self.log.is_some() {
             self.note(federate, "is at", &position);
+        }
+        if self.decentralized {
+            return;
         }
         let upstream = self.topology.upstream(FederateId::from_index(federate));
         if upstream.is_empty() || self.start.is_none_or(|start| position.at < start) {

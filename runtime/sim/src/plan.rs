@@ -54,7 +54,7 @@ pub fn run_plan<E: SimulatedExecutor>(plan: &Plan, parts: Vec<Part<E>>, seed: u6
     };
     let mut observer = Observer::of_plan(plan);
     observer.extensions = plan.extensions;
-    World::new(members, observer, conditions, &rng).run()
+    World::new(members, plan, observer, conditions, &rng).run()
 }
 
 /// The world of a seed, without what the plan already says.

@@ -3,6 +3,7 @@
 use crate::coverage::{Coverage, Feature};
 use crate::executor::{Record, SyntheticExecutor};
 use crate::observer::{Observer, Violation};
+use crate::offsets::decentralize;
 use crate::program::Federation;
 use crate::reference::{OutsideEvent, reference};
 use crate::seed::{Rng, mix};
@@ -30,17 +31,36 @@ pub struct Verdict {
     pub log: Option<String>,
 }
 
+/// How the federations of seeds are coordinated.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Kind {
+    /// By the RTI's grants.
+    #[default]
+    Centralized,
+    /// By clocks and STP offsets.
+    Decentralized,
+}
+
+impl Kind {
+    fn draw(self, rng: &mut Rng) -> Swarm {
+        match self {
+            Self::Centralized => Swarm::draw(rng),
+            Self::Decentralized => Swarm::draw_decentralized(rng),
+        }
+    }
+}
+
 /// Checks one seed.
 #[must_use]
-pub fn check_seed(seed: u64, mutants: Mutants) -> Verdict {
-    check_seed_logged(seed, mutants, false)
+pub fn check_seed(seed: u64, kind: Kind, mutants: Mutants) -> Verdict {
+    check_seed_logged(seed, kind, mutants, false)
 }
 
 /// Checks one seed and, if asked to, keeps a log of the run that broke a law, or else of the first.
 #[must_use]
-pub fn check_seed_logged(seed: u64, mutants: Mutants, log: bool) -> Verdict {
+pub fn check_seed_logged(seed: u64, kind: Kind, mutants: Mutants, log: bool) -> Verdict {
     let mut rng = Rng::new(seed);
-    let swarm = Swarm::draw(&mut rng);
+    let swarm = kind.draw(&mut rng);
     let federation = Federation::generate(&swarm, &mut rng);
     let mut first = simulate(&federation, &swarm, mutants, &rng.fork(1), log);
     let mut verdict = Verdict {
@@ -51,6 +71,9 @@ pub fn check_seed_logged(seed: u64, mutants: Mutants, log: bool) -> Verdict {
         log: first.observer.log.take(),
         swarm,
     };
+    if verdict.swarm.mode.offsets.is_some() {
+        verdict.coverage.hit(Feature::Decentralized);
+    }
     cover_structure(&federation, &mut verdict.coverage, &verdict.swarm);
     if verdict.violation.is_some() {
         return verdict;
@@ -74,9 +97,9 @@ pub fn check_seed_logged(seed: u64, mutants: Mutants, log: bool) -> Verdict {
 
 /// The federation of a seed in words: reactors, reactions, connections.
 #[must_use]
-pub fn describe(seed: u64) -> String {
+pub fn describe(seed: u64, kind: Kind) -> String {
     let mut rng = Rng::new(seed);
-    let swarm = Swarm::draw(&mut rng);
+    let swarm = kind.draw(&mut rng);
     Federation::generate(&swarm, &mut rng).to_string()
 }
 
@@ -93,7 +116,10 @@ pub fn simulate(
     rng: &Rng,
     log: bool,
 ) -> Run<SyntheticExecutor> {
-    let plan = federation.plan();
+    let mut plan = federation.plan();
+    if let Some(offsets) = swarm.mode.offsets {
+        decentralize(&mut plan, swarm, offsets, &mut rng.fork(3));
+    }
     let topology = Topology::of_plan(&plan);
     let legacy = legacy_sources(&topology, swarm);
     let payload = if rng.fork(9).percent(10) { 3_000 } else { 0 };
@@ -124,7 +150,7 @@ pub fn simulate(
     observer.log = log.then(String::new);
     observer.physical = swarm.shape.physical;
     observer.extensions = swarm.mode.extensions;
-    World::new(members.collect(), observer, conditions, rng).run()
+    World::new(members.collect(), &plan, observer, conditions, rng).run()
 }
 
 /// The federates that may announce by LTC alone: they have no upstream, and whoever hears from them hears from no others
@@ -313,7 +339,12 @@ impl Limit {
         swarm: &Swarm,
     ) -> Self {
         let (stop, at) = (member.stop, member.at);
-        let promise = run.observer.promise(index);
+        let decentralized = swarm.mode.offsets.is_some();
+        let promise = if decentralized {
+            None
+        } else {
+            run.observer.promise(index)
+        };
         let before_stop = stop.latest_earlier();
         let last = match run.victim {
             // It may have died amid a tag.
@@ -324,6 +355,7 @@ impl Limit {
             Some(Victim::Federate(_)) if matches!(member.outcome, Some(Outcome::RtiFailed)) => {
                 before_stop.latest_earlier()
             }
+            Some(Victim::Federate(_)) if decentralized => before_stop.latest_earlier(),
             Some(Victim::Federate(_)) => promise.map_or(before_stop, |p| p.min(before_stop)),
             // The last tag may have been left half done, and shutdown ran early.
             Some(Victim::Rti) if at >= stop => before_stop.latest_earlier(),
@@ -334,6 +366,11 @@ impl Limit {
             // Others ended later, and ran no shutdown at this one's stop tag.
             None if survivors(run).any(|(_, m)| m.stop > stop) => before_stop,
             None => stop,
+        };
+        // From the first counted violation, or the loss of anybody, on, time may have decided otherwise than the program.
+        let last = match run.faithful {
+            Some(tag) if decentralized => last.min(tag.latest_earlier()),
+            Some(_) | None => last,
         };
         Self {
             last,

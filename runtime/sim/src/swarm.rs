@@ -66,6 +66,19 @@ pub struct Mode {
     pub legacy_sources: bool,
     /// Nothing is slow: whatever is late is late for no good reason.
     pub calm: bool,
+    /// Time and STP offsets decide, instead of the RTI; and what the offsets are.
+    pub offsets: Option<Offsets>,
+}
+
+/// STP offsets under decentralized coordination.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub enum Offsets {
+    /// Solved from bounds that hold mostly.
+    Solved,
+    /// Zero.
+    Zero,
+    /// Any, different per connection.
+    Random,
 }
 
 /// What ends the run.
@@ -144,6 +157,35 @@ impl Swarm {
         }
     }
 
+    /// Draws the options of a run under decentralized coordination.
+    #[must_use]
+    pub fn draw_decentralized(rng: &mut Rng) -> Self {
+        let mut swarm = Self::draw(rng);
+        swarm.mode.offsets = Some(*rng.pick(&[
+            Offsets::Solved,
+            Offsets::Solved,
+            Offsets::Zero,
+            Offsets::Random,
+        ]));
+        swarm.mode.fast = false;
+        swarm.mode.max_lead = None;
+        swarm.mode.legacy_sources = false;
+        swarm.mode.extensions = true;
+        swarm.mode.calm = false;
+        swarm.federates = swarm.federates.min(8);
+        // In a cycle each waits for the other's end.
+        if swarm.ending == Ending::Starvation {
+            swarm.ending = Ending::Timeout;
+        }
+        if rng.percent(40) {
+            swarm.mode.reaction = Duration::ZERO;
+            swarm.network.clog = 0;
+            swarm.network.partitions = 0;
+        }
+        swarm.clocks.offset = swarm.clocks.offset.min(20.ms());
+        swarm
+    }
+
     /// Without anything that takes time, and without cycles.
     fn calmed(mut self) -> Self {
         self.shape.cycles = false;
@@ -185,6 +227,7 @@ fn draw_mode(physical: bool, rng: &mut Rng) -> Mode {
         extensions: rng.percent(75),
         legacy_sources: rng.percent(30),
         calm: false,
+        offsets: None,
     }
 }
 

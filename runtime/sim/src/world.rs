@@ -4,6 +4,7 @@
 //! does with sockets and waits, the world does with an event queue over true time.
 
 mod host;
+mod roads;
 mod rti;
 
 use crate::coverage::Feature;
@@ -14,7 +15,9 @@ use crate::swarm::{Ending, Swarm};
 use host::Host;
 use ictus_coord::federate::{FederateConfig, LinkConfig, Outcome};
 use ictus_coord::mutants::Mutants;
+use ictus_coord::plan::Plan;
 use ictus_core::{Duration, NodeId, Program, Tag};
+use roads::{Laws, Road};
 use rti::RtiHost;
 use std::cmp::Reverse;
 use std::collections::BinaryHeap;
@@ -63,6 +66,9 @@ pub struct World<E> {
     sequence: u64,
     hosts: Vec<Host<E>>,
     rti: RtiHost,
+    /// Connections from federate to federate.
+    roads: Vec<Road>,
+    laws: Laws,
     observer: Observer,
     wakes: Vec<i64>,
     crashed: Option<(i64, Victim)>,
@@ -104,6 +110,8 @@ pub struct Run<E> {
     pub observer: Observer,
     /// True time at the end.
     pub duration: Duration,
+    /// Under decentralized coordination: from this tag on, what ran may differ from the program alone.
+    pub faithful: Option<Tag>,
 }
 
 /// How one federate ended.
@@ -134,6 +142,7 @@ impl<E: SimulatedExecutor> World<E> {
     #[must_use]
     pub fn new(
         members: Vec<Member<E>>,
+        plan: &Plan,
         observer: Observer,
         conditions: Conditions,
         rng: &Rng,
@@ -149,6 +158,8 @@ impl<E: SimulatedExecutor> World<E> {
             rti: RtiHost::new(count, &conditions, rng.fork(0xd1)),
             rng: draw,
             now: 0,
+            roads: Vec::new(),
+            laws: Laws::of_plan(plan),
             queue: BinaryHeap::new(),
             sequence: 0,
             observer,
@@ -184,6 +195,7 @@ impl<E: SimulatedExecutor> World<E> {
             let stuck = self.describe_stuck();
             self.observer.blame("liveness", stuck);
         }
+        self.check_laws();
         for host in &self.hosts {
             let counters = host.counters();
             let coverage = &mut self.observer.coverage;
@@ -192,6 +204,7 @@ impl<E: SimulatedExecutor> World<E> {
         }
         Run {
             start: self.observer.start(),
+            faithful: self.laws.faithful,
             members: self.hosts.into_iter().map(Host::into_ended).collect(),
             victim: self.crashed.map(|c| c.1),
             duration: Duration::from_nanos(self.now),
@@ -386,6 +399,9 @@ impl<E: SimulatedExecutor> World<E> {
         let now = self.now;
         self.hosts[federate].die(now, lose, &mut self.wakes);
         self.wake_rti_for_arrivals();
+        self.break_roads(federate, lose);
+        let at = self.hosts[federate].federate.timeline().at();
+        self.laws.differs_from(at);
         if !self.rti.knows(federate) {
             self.rti.give_up(now);
             self.wake_rti(now);
@@ -400,6 +416,10 @@ impl<E: SimulatedExecutor> World<E> {
         self.crashed = Some((self.now, Victim::Rti));
         self.observer.lose();
         self.rti.die();
+        // Each ends where it learns of it.
+        for host in &self.hosts {
+            self.laws.differs_from(host.federate.timeline().at());
+        }
         for federate in 0..self.hosts.len() {
             let lose = self.rng.percent(50);
             let now = self.now;

@@ -21,12 +21,19 @@ pub(super) enum Phase {
     AwaitingAck,
     /// Comparing clocks.
     Synchronizing(Exchanges),
+    /// Connecting with the other federates.
+    Meeting,
     /// Own time proposed.
     AwaitingStart,
     /// Executing tags.
     Running,
-    /// Resigned; waiting for the RTI to close.
-    Draining,
+    /// Resigned; waiting for the RTI and for senders to close, but not for ever.
+    Draining {
+        /// Whether the RTI has.
+        rti_closed: bool,
+        /// When waiting began.
+        since: PhysicalTime,
+    },
     /// Done.
     Ended,
 }
@@ -37,9 +44,10 @@ impl Phase {
             Self::Idle => "not connected",
             Self::AwaitingAck => "waiting for the RTI to accept the join",
             Self::Synchronizing(_) => "comparing clocks",
+            Self::Meeting => "connecting with other federates",
             Self::AwaitingStart => "waiting for the start time",
             Self::Running => "running",
-            Self::Draining => "leaving",
+            Self::Draining { .. } => "leaving",
             Self::Ended => "ended",
         }
     }
@@ -104,9 +112,10 @@ impl Federate {
             Phase::AwaitingAck => ": is an RTI listening there?",
             Phase::Synchronizing(_) => ": an RTI with `-c off` compares no clocks",
             Phase::Idle
+            | Phase::Meeting
             | Phase::AwaitingStart
             | Phase::Running
-            | Phase::Draining
+            | Phase::Draining { .. }
             | Phase::Ended => "",
         };
         let phase = self.phase.name();
@@ -146,11 +155,11 @@ impl Federate {
     ) -> Result<(), Outcome> {
         self.answer_by = None;
         match (&mut self.phase, message) {
-            (Phase::Draining | Phase::Ended, _) => Ok(()),
+            (Phase::Draining { .. } | Phase::Ended, _) => Ok(()),
             (_, ToFederate::Reject(reason)) => Err(Outcome::Rejected(*reason)),
             (Phase::Running, _) => self.handle_running(now, message, executor),
             (Phase::AwaitingAck, ToFederate::Ack) => {
-                self.introduce(now);
+                self.introduce();
                 Ok(())
             }
             (Phase::Synchronizing(exchanges), ToFederate::ClockSyncT1(t1)) => {
@@ -162,7 +171,11 @@ impl Federate {
                 Ok(())
             }
             (Phase::Synchronizing(_), ToFederate::ClockSyncT4(t4)) => {
-                self.take_exchange(now, *t4);
+                self.take_exchange(*t4);
+                Ok(())
+            }
+            (Phase::Meeting, ToFederate::AddressQueryReply { port, address }) => {
+                self.take_address(now, *port, *address);
                 Ok(())
             }
             (Phase::AwaitingStart, ToFederate::Timestamp(start)) => {
@@ -179,7 +192,7 @@ impl Federate {
     }
 
     /// After the ACK: structure, clock port, what we can do; then clocks or the own time.
-    fn introduce(&mut self, now: PhysicalTime) {
+    fn introduce(&mut self) {
         let Some(link) = &mut self.link else { return };
         self.events.push_back(FederateEvent::Joined);
         link.say(&ToRti::NeighborStructure(link.neighbors()));
@@ -198,14 +211,21 @@ impl Federate {
             Some(wanted) if wanted > 0 => {
                 self.phase = Phase::Synchronizing(Exchanges::new(wanted));
             }
-            Some(_) | None => {
-                link.say(&ToRti::Timestamp(now));
-                self.phase = Phase::AwaitingStart;
-            }
+            Some(_) | None => self.advertise(),
         }
     }
 
-    fn take_exchange(&mut self, now: PhysicalTime, t4: PhysicalTime) {
+    /// After the clocks: says where others can connect; then this federate meets those that it sends to.
+    fn advertise(&mut self) {
+        let Some(link) = &mut self.link else { return };
+        if let Some(port) = link.peers.port {
+            let port = i32::from(port);
+            link.say(&ToRti::AddressAdvertisement { port });
+        }
+        self.phase = Phase::Meeting;
+    }
+
+    fn take_exchange(&mut self, t4: PhysicalTime) {
         let Phase::Synchronizing(exchanges) = &mut self.phase else {
             return;
         };
@@ -221,12 +241,10 @@ impl Federate {
         if exchanges.errors.len() < exchanges.wanted as usize {
             return;
         }
+        // Its own time is proposed at the next poll, when the driver has corrected the clock.
         let offset = exchanges.offset();
         self.events.push_back(FederateEvent::ClockOffset(offset));
-        self.phase = Phase::AwaitingStart;
-        if let Some(link) = &mut self.link {
-            link.say(&ToRti::Timestamp(now.saturating_add(offset)));
-        }
+        self.advertise();
     }
 
     fn handle_running(
@@ -307,10 +325,19 @@ impl Federate {
     /// current tag is finished and shutdown reactions run.
     pub fn handle_disconnect(&mut self) {
         match self.phase {
-            Phase::Draining => self.phase = Phase::Ended,
+            Phase::Draining {
+                ref mut rti_closed, ..
+            } => {
+                *rti_closed = true;
+                self.end_if_all_gone();
+            }
             Phase::Running => self.abandon(Outcome::RtiLost),
             Phase::Ended => {}
-            Phase::Idle | Phase::AwaitingAck | Phase::Synchronizing(_) | Phase::AwaitingStart => {
+            Phase::Idle
+            | Phase::AwaitingAck
+            | Phase::Synchronizing(_)
+            | Phase::Meeting
+            | Phase::AwaitingStart => {
                 self.link.as_mut().map(Link::output).map(Vec::clear);
                 self.end_with(Outcome::RtiLost);
             }

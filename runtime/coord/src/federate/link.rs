@@ -1,13 +1,15 @@
 //! The link to the RTI under centralized coordination: what is announced (NET, LTC), granted (TAG, PTAG) and sent.
 
+use crate::measure::Measures;
 use crate::mutants::{Mutant, Mutants};
-use crate::plan::{ClockSync, Plan};
+use super::peers::Peers;
+use crate::plan::{ClockSync, ConnectionPlan, Coordination, OnFailure, Plan, Wire};
 use crate::topology::{FederateId, Topology, connection_delay, zero_delay_cycle_inputs};
-use crate::wire::{self, NeighborStructure, PortAbsent, ToRti};
+use crate::wire::{self, NeighborStructure, PortAbsent, ToPeer, ToRti};
 use ictus_core::{
     Delay, Duration, InputId, LogicalTime, NodeId, OutputId, PhysicalTime, Program, Tag, Timeline,
 };
-use std::collections::VecDeque;
+use std::collections::{BTreeSet, VecDeque};
 use std::sync::Arc;
 
 /// How often a federate with physical actions renews its promise when it is not known what downstreams wait for.
@@ -41,6 +43,16 @@ pub struct LinkConfig {
     pub max_lead: Option<Duration>,
     /// Whether the program runs ahead of physical time.
     pub fast: bool,
+    /// Whether time and STP offsets decide, and messages go from federate to federate.
+    pub decentralized: bool,
+    /// The layout of the messages that differ between LF's releases.
+    pub wire: Wire,
+    /// This federate's STP offset S: its launch lag is measured from there.
+    pub stp_offset: Duration,
+    /// The STP violation of this number makes the federate stop the federation.
+    pub max_stp_violations: Option<u64>,
+    /// The federates that a federate's loss concerns: those that it reaches over other federates.
+    pub indirect_upstream: Vec<u16>,
     /// Rules that are wrong; none but in tests.
     #[doc(hidden)]
     pub mutants: Mutants,
@@ -57,18 +69,31 @@ impl LinkConfig {
     pub fn from_plan(plan: &Plan, id: u16, inputs: &[usize], outputs: &[usize]) -> Self {
         let topology = Topology::of_plan(plan);
         let me = FederateId::new(id);
-        let neighbors = topology.neighbor_structure(me);
+        let decentralized = plan.coordination == Coordination::Decentralized;
+        let neighbors = if decentralized {
+            NeighborStructure::default()
+        } else {
+            topology.neighbor_structure(me)
+        };
         let in_cycle = zero_delay_cycle_inputs(plan, &topology, me);
-        let input = |index: &usize| InputLink {
-            federate: plan.connections[*index].from.federate,
-            port_id: plan.connections[*index].port_id,
-            in_cycle: in_cycle.contains(index),
+        let input = |index: &usize| {
+            let in_cycle = in_cycle.contains(index);
+            InputLink::of_plan(plan, &plan.connections[*index], in_cycle)
         };
         let output = |index: &usize| OutputLink {
             federate: plan.connections[*index].to.federate,
             port_id: plan.connections[*index].port_id,
             delay: connection_delay(&plan.connections[*index]),
+            physical: plan.connections[*index].physical,
         };
+        let direct = |f: &u16| topology.upstream(me).iter().any(|(u, _)| u.get() == *f);
+        let over_others = |f: &u16| {
+            let via = topology.upstream(me).iter().map(|(u, _)| *u);
+            let reaches = |u: FederateId| topology.sources(u).iter().any(|(s, _)| s.get() == *f);
+            via.into_iter().any(|u| u.get() != *f && u != me && reaches(u))
+        };
+        let sources = topology.sources(me).iter().map(|(f, _)| f.get());
+        let indirect_upstream = sources.filter(|f| !direct(f) || over_others(f)).collect();
         Self {
             id,
             federation: String::new(),
@@ -82,6 +107,11 @@ impl LinkConfig {
             extensions: plan.extensions,
             max_lead: plan.max_lead_ns.map(Duration::from_nanos),
             fast: plan.fast,
+            decentralized,
+            wire: plan.wire,
+            stp_offset: Duration::from_nanos(plan.federates[usize::from(id)].stp_offset_ns),
+            max_stp_violations: plan.federates[usize::from(id)].max_stp_violations,
+            indirect_upstream,
             mutants: Mutants::NONE,
         }
     }
@@ -97,6 +127,40 @@ pub struct InputLink {
     /// Whether it comes without delay from a member of this federate's zero-delay cycle: a provisional grant leaves
     /// its status unknown.
     pub in_cycle: bool,
+    /// Whether messages come without tag, straight from the sender.
+    pub physical: bool,
+    /// The connection's delay.
+    pub delay: Delay,
+    /// How long after a tag's time its status may stay unknown before it counts as absent; never negative.
+    pub stp_offset: Duration,
+    /// How much longer at a tag that was begun.
+    pub absent_after: Duration,
+    /// The sender's own STP offset.
+    pub sender_offset: Duration,
+    /// Whether the sender is ours, and says goodbye before it closes.
+    pub says_goodbye: bool,
+    /// Whether the others go on when the sender is lost.
+    pub outlived: bool,
+}
+
+impl InputLink {
+    fn of_plan(plan: &Plan, connection: &ConnectionPlan, in_cycle: bool) -> Self {
+        let sender = &plan.federates[usize::from(connection.from.federate)];
+        let receiver = &plan.federates[usize::from(connection.to.federate)];
+        let offset = connection.stp_offset_ns.unwrap_or(receiver.stp_offset_ns);
+        Self {
+            federate: connection.from.federate,
+            port_id: connection.port_id,
+            in_cycle,
+            physical: connection.physical,
+            delay: connection_delay(connection),
+            stp_offset: Duration::from_nanos(offset.max(0)),
+            absent_after: Duration::from_nanos(connection.absent_after_ns.max(0)),
+            sender_offset: Duration::from_nanos(sender.stp_offset_ns),
+            says_goodbye: sender.class.is_some(),
+            outlived: sender.on_failure == OnFailure::Continue,
+        }
+    }
 }
 
 /// A network output on the wire.
@@ -108,6 +172,8 @@ pub struct OutputLink {
     pub port_id: u16,
     /// The connection's delay.
     pub delay: Delay,
+    /// Whether messages go without tag, straight to the receiver.
+    pub physical: bool,
 }
 
 /// Whether a tag may be entered as far as the RTI is concerned.
@@ -151,6 +217,7 @@ pub(super) struct Link {
     silent_at: Option<Tag>,
     /// Lost federates, with the tags up to which they had sent all they would.
     lost: Vec<(u16, Tag)>,
+    pub(super) peers: Peers,
 }
 
 /// A run of messages that downstreams have not confirmed, by the tags they have there.
@@ -158,6 +225,24 @@ pub(super) struct Link {
 struct Sent {
     first: Tag,
     last: Tag,
+}
+
+/// The connections with other federates: all under decentralized coordination, else the physical ones.
+fn peers(config: &LinkConfig) -> Peers {
+    let distinct = |peers: &mut Vec<u16>| {
+        peers.sort_unstable();
+        peers.dedup();
+    };
+    let direct = |physical: bool| physical || config.decentralized;
+    let inputs = config.inputs.iter().filter(|i| direct(i.physical));
+    let outputs = config.outputs.iter().filter(|o| direct(o.physical));
+    let mut senders = inputs.map(|i| i.federate).collect();
+    let mut receivers = outputs.map(|o| o.federate).collect();
+    distinct(&mut senders);
+    distinct(&mut receivers);
+    let mut peers = Peers::new(config.id, config.wire, senders, receivers);
+    peers.name_federation(&config.federation);
+    peers
 }
 
 impl Link {
@@ -189,6 +274,7 @@ impl Link {
             silent: false,
             silent_at: None,
             lost: Vec::new(),
+            peers: peers(&config),
             config,
         }
     }
@@ -394,6 +480,9 @@ impl Link {
     /// Takes back what was granted at `stop` and after, as our RTI does when a stop is agreed. LF's does not: there, what
     /// this federate writes at the stop tag stays here if it comes before what was announced.
     pub(super) fn revoke_from(&mut self, stop: Tag, timeline: &mut Timeline) {
+        if self.config.decentralized {
+            return;
+        }
         if !self.config.extensions {
             self.silent_at = (self.announced > stop).then_some(stop);
             return;
@@ -465,6 +554,9 @@ impl Link {
     /// Ends a tag: downstreams may count on it when a network input was handled or the cycle waits for it.
     #[inline]
     pub(super) fn completed(&mut self, tag: Tag, network_inputs_ran: bool) {
+        if self.config.decentralized {
+            return;
+        }
         if network_inputs_ran || self.config.in_cycle {
             self.confirm(tag);
         }
@@ -484,7 +576,15 @@ impl Link {
         }
     }
 
-    /// Sends the value of `output`; says whether it was sent (not after the stop tag, nor past the end of time).
+    /// Nothing measured yet, of all peers.
+    pub(super) fn measures(&self) -> Measures {
+        let upstreams: BTreeSet<u16> = self.config.inputs.iter().map(|i| i.federate).collect();
+        let downstreams: BTreeSet<u16> = self.config.outputs.iter().map(|o| o.federate).collect();
+        let list = |set: BTreeSet<u16>| set.into_iter().collect::<Vec<_>>();
+        Measures::new(&list(upstreams), &list(downstreams))
+    }
+
+    /// Sends the value of `output` and says how many bytes that took; not after the stop tag, nor past the end of time.
     #[inline]
     pub(super) fn send(
         &mut self,
@@ -492,21 +592,35 @@ impl Link {
         output: OutputId,
         timeline: &Timeline,
         payload: impl FnOnce(&mut Vec<u8>),
-    ) -> bool {
+    ) -> Option<usize> {
         let at = timeline.at();
         self.told_at[node.index()] = at;
         let link = self.config.outputs[output.index()];
         let tag = at.delayed(link.delay);
+        if link.physical {
+            let out = self.peers.to(link.federate)?;
+            let before = out.len();
+            wire::encode_peer_message(link.port_id, link.federate, None, out, payload);
+            return Some(out.len() - before);
+        }
         if self.silent || self.silent_at == Some(at) {
             if self.config.in_cycle {
                 self.say_absent(output, at);
             }
-            return false;
+            return None;
         }
         if tag > timeline.stop_tag() || tag == Tag::FOREVER {
-            return false;
+            return None;
         }
+        if self.config.decentralized {
+            let out = self.peers.to(link.federate)?;
+            let before = out.len();
+            wire::encode_peer_message(link.port_id, link.federate, Some(tag), out, payload);
+            return Some(out.len() - before);
+        }
+        let before = self.out.len();
         wire::encode_tagged_message(link.port_id, link.federate, tag, &mut self.out, payload);
+        let bytes = self.out.len() - before;
         if let Some(through) = &mut self.not_needed_through {
             *through = (*through).min(tag);
         }
@@ -520,7 +634,7 @@ impl Link {
                 }),
             }
         }
-        true
+        Some(bytes)
     }
 
     /// Unconfirmed tags closer than this are counted as one run.
@@ -571,12 +685,37 @@ impl Link {
             return;
         }
         let link = self.config.outputs[output.index()];
+        if link.physical {
+            return;
+        }
         let absent = PortAbsent {
             port: link.port_id,
             federate: link.federate,
             tag: at.delayed_strict(link.delay),
         };
-        ToRti::PortAbsent(absent).encode(&mut self.out);
+        if !self.config.decentralized {
+            ToRti::PortAbsent(absent).encode(&mut self.out);
+        } else if let Some(out) = self.peers.to(link.federate) {
+            ToPeer::PortAbsent(absent).encode(self.config.wire, out);
+        }
+    }
+
+    /// Tells the receivers that nothing will come any more, and ends the streams.
+    fn say_goodbye(&mut self) {
+        for link in &self.config.outputs {
+            if self.config.decentralized
+                && !link.physical
+                && let Some(out) = self.peers.to(link.federate)
+            {
+                let absent = PortAbsent {
+                    port: link.port_id,
+                    federate: link.federate,
+                    tag: Tag::FOREVER,
+                };
+                ToPeer::PortAbsent(absent).encode(self.config.wire, out);
+            }
+        }
+        self.peers.leave();
     }
 
     /// From now on nothing is sent to other federates: they have been told that nothing will come.
@@ -601,13 +740,16 @@ impl Link {
 
     /// The last words at the stop tag.
     pub(super) fn resign(&mut self) {
-        self.pending_announcement = Some(Tag::FOREVER);
+        self.say_goodbye();
+        // Under decentralized coordination nobody asks for it.
+        self.pending_announcement = (!self.config.decentralized).then_some(Tag::FOREVER);
         self.flush();
         ToRti::Resign.encode(&mut self.out);
     }
 
     /// The last word of a federate that cannot go on.
     pub(super) fn fail(&mut self) {
+        self.peers.leave();
         self.pending_announcement = None;
         ToRti::Failed.encode(&mut self.out);
     }

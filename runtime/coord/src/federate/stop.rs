@@ -4,7 +4,7 @@ use super::join::Phase;
 use super::{Federate, FederateEvent, Outcome, Poll};
 use crate::mutants::Mutant;
 use crate::wire::ToRti;
-use ictus_core::{PhysicalTime, Tag, Timeline};
+use ictus_core::{InputId, PhysicalTime, Tag, Timeline};
 
 /// What a stop in progress allows.
 #[derive(Debug, Default)]
@@ -13,6 +13,7 @@ pub(super) struct Stop {
     /// The last tag at which a lost federate's silence is no false absence.
     limit: Option<Tag>,
     lost: Option<u16>,
+    violated: bool,
     abandoned: Option<Outcome>,
 }
 
@@ -65,6 +66,11 @@ impl Stop {
     /// Whether reactions that wait for inputs at `at` wait in vain: what they wait for is lost.
     pub(super) fn gives_up(&self, at: Tag) -> bool {
         self.abandoned.is_some() || (self.consensus == Consensus::Granted && self.past_limit(at))
+    }
+
+    /// The stop that is asked for next is because of STP violations.
+    pub(super) fn too_many_violations(&mut self) {
+        self.violated = true;
     }
 
     /// Whether messages have come too late to matter: nothing but shutdown runs, or has run, at `at`.
@@ -147,8 +153,11 @@ impl Federate {
 
     /// Takes FEDERATE_LOST: after `limit`, an absence could be a lie.
     pub(super) fn peer_lost(&mut self, federate: u16, limit: Tag) {
+        self.unexplained = None;
         let limit = if self.has_mutant(Mutant::PromiseIgnored) {
             Tag::FOREVER
+        } else if self.is_decentralized() {
+            self.last_safe(federate)
         } else {
             limit
         };
@@ -160,6 +169,20 @@ impl Federate {
             self.stop.lost = Some(federate);
             self.events.push_back(FederateEvent::PeerLost(federate));
         }
+    }
+
+    /// Under decentralized coordination: the last tag at which the silence of lost `federate` is no false absence. What has come
+    /// from it over other federates cannot be told apart, so then it is the tag reached.
+    fn last_safe(&self, federate: u16) -> Tag {
+        let at = self.timeline.at();
+        let Some(link) = &self.link else { return at };
+        if link.config.indirect_upstream.contains(&federate) {
+            return at;
+        }
+        let inputs = link.config.inputs.iter().enumerate();
+        let of_it = inputs.filter(|(_, input)| input.federate == federate && !input.physical);
+        let known = of_it.map(|(index, _)| self.timeline.known(InputId::new(index)));
+        known.min().map_or(Tag::FOREVER, |known| known.max(at))
     }
 
     /// No grant will come any more: the current tag is finished as far as its inputs are known, then shutdown.
@@ -176,13 +199,23 @@ impl Federate {
         let abandoned = self.stop.abandoned.take();
         let lost = self.stop.lost;
         let stays = abandoned.is_none();
-        let reached = lost.map_or(Outcome::Stopped, Outcome::PeerLost);
+        let reached = match lost {
+            Some(lost) => Outcome::PeerLost(lost),
+            None if self.stop.violated => {
+                Outcome::TooManyViolations(self.counters.stp_violations)
+            }
+            None => Outcome::Stopped,
+        };
         self.outcome = Some(abandoned.unwrap_or(reached));
         match &mut self.link {
             Some(link) if stays => {
                 link.resign();
-                self.phase = Phase::Draining;
-                Poll::Wait(None)
+                let since = self.now;
+                self.phase = Phase::Draining {
+                    rti_closed: false,
+                    since,
+                };
+                Poll::Wait(Some(since.saturating_add(super::LAST_WORDS_MAX)))
             }
             Some(_) | None => {
                 self.phase = Phase::Ended;
@@ -191,10 +224,16 @@ impl Federate {
         }
     }
 
+    /// Whether nothing but shutdown can run any more, or has run: messages are of no use.
+    #[must_use]
+    pub fn only_shutdown_left(&self) -> bool {
+        self.stop.over(self.timeline.at())
+    }
+
     /// Whether everything is said: the driver half-closes and reads to the end.
     #[must_use]
     pub fn resigned(&self) -> bool {
-        matches!(self.phase, Phase::Draining)
+        matches!(self.phase, Phase::Draining { .. })
     }
 }
 

@@ -10,7 +10,7 @@ use crate::seed::Rng;
 use crate::swarm::Ending;
 use ictus_coord::federate::{Counters, Federate, FederateEvent, Poll};
 use ictus_coord::wire::{ToRti, kind};
-use ictus_core::{ActionId, ActionKind, Duration, NodeId, PhysicalTime, Tag};
+use ictus_core::{ActionId, ActionKind, Duration, InputId, NodeId, PhysicalTime, Tag};
 use std::collections::BTreeMap;
 
 /// One host with one federate.
@@ -110,6 +110,31 @@ impl<E: SimulatedExecutor> Host<E> {
         }
     }
 
+    pub(super) fn is_alive(&self) -> bool {
+        self.state == State::Alive
+    }
+
+    /// Whether `input` has been decided at `tag`: it was present, absent, or the tag is over. `None` when nothing is
+    /// admitted any more.
+    pub(super) fn has_decided(&self, input: InputId, tag: Tag) -> Option<bool> {
+        let timeline = self.federate.timeline();
+        if self.federate.only_shutdown_left() || self.is_over() {
+            return None;
+        }
+        let (at, executing) = (timeline.at(), timeline.current().is_some());
+        Some(at > tag || (at == tag && (!executing || timeline.known(input) >= tag)))
+    }
+
+    /// Whether the tardy message of `input` that was due at `tag` has run its reactions as tardy; `None` when that tag
+    /// was not executed, or nothing reads the input.
+    pub(super) fn handled_tardy(&self, input: InputId, tag: Tag) -> Option<bool> {
+        let timeline = self.federate.timeline();
+        let read = timeline.program().triggers_reaction(input);
+        let executed = timeline.at() > tag || (timeline.at() == tag && timeline.current().is_none());
+        let ordinary = tag < timeline.stop_tag();
+        (read && executed && ordinary).then(|| self.executor.ran_tardy(tag))
+    }
+
     pub(super) fn is_over(&self) -> bool {
         matches!(self.state, State::Over | State::Dead)
     }
@@ -201,6 +226,9 @@ impl<E: SimulatedExecutor> World<E> {
             return;
         }
         host.state = State::Alive;
+        if host.federate.expects_peers() {
+            host.federate.listening(1);
+        }
         host.federate.connect();
         self.rti.accept(self.now, federate);
         self.drive(federate);
@@ -217,6 +245,9 @@ impl<E: SimulatedExecutor> World<E> {
             return;
         }
         self.read(federate);
+        self.read_roads(federate);
+        // A correction of the clock comes before the next reading.
+        self.take_events(federate);
         self.poll(federate);
         self.show(federate);
         self.take_events(federate);
@@ -271,6 +302,7 @@ impl<E: SimulatedExecutor> World<E> {
                 }
                 Poll::Ended => {
                     self.write(federate);
+                    self.write_roads(federate);
                     let host = &mut self.hosts[federate];
                     host.up.close(self.now, &mut self.wakes);
                     host.state = State::Over;
@@ -368,7 +400,7 @@ impl<E: SimulatedExecutor> World<E> {
         host.in_flight.retain(|n| *n != node);
         let tag = host.federate.timeline().at();
         host.federate.run_node(node, tag, &mut host.executor);
-        host.federate.finish(&[node]);
+        host.federate.finish(&[node], &mut host.executor);
         self.drive(federate);
     }
 
@@ -393,6 +425,7 @@ impl<E: SimulatedExecutor> World<E> {
             host.up.close(self.now, &mut self.wakes);
         }
         self.wake_rti_for_arrivals();
+        self.write_roads(federate);
     }
 
     fn wait(&mut self, federate: usize, until: Option<PhysicalTime>) {
@@ -426,7 +459,11 @@ impl<E: SimulatedExecutor> World<E> {
                     let at = clock.when(start.time.as_physical()).unwrap_or(self.now);
                     self.plan_run(at.max(self.now));
                 }
-                FederateEvent::Joined
+                FederateEvent::Connect { peer, .. } => self.meet(federate, peer),
+                FederateEvent::PeerRefused(words) => self.observer.blame("safety", words),
+                FederateEvent::Lag(_)
+                | FederateEvent::StpViolation { .. }
+                | FederateEvent::Joined
                 | FederateEvent::Running
                 | FederateEvent::StopRequested
                 | FederateEvent::StopGranted(_)
