@@ -34,8 +34,8 @@ use ictus_core::{
 };
 use join::Phase;
 pub use link::{InputLink, LinkConfig, OutputLink};
-pub use peers::PeerStream;
 use link::{Link, Permission};
+pub use peers::PeerStream;
 use std::collections::VecDeque;
 use std::sync::Arc;
 use thiserror::Error;
@@ -195,7 +195,9 @@ pub enum ProtocolError {
     #[error("message for federate {0}")]
     WrongFederate(u16),
     /// A federate wrote to a port that another one feeds, or in another way than the plan says.
-    #[error("message for port {port}, which the plan does not let federate {peer} write to like this")]
+    #[error(
+        "message for port {port}, which the plan does not let federate {peer} write to like this"
+    )]
     NotItsPort {
         /// The port id.
         port: u16,
@@ -715,7 +717,10 @@ impl Federate {
         if self.launches.is_empty() {
             return;
         }
-        let offset = self.link.as_ref().map_or(Duration::ZERO, |link| link.config.stp_offset);
+        let offset = self
+            .link
+            .as_ref()
+            .map_or(Duration::ZERO, |link| link.config.stp_offset);
         for (receiver, time) in self.launches.drain(..) {
             let due = time.as_physical().saturating_add(offset);
             self.measures.launch_lag(receiver, now.since(due));

@@ -19,7 +19,7 @@ mod tardiness;
 
 use crate::graph::BitSet;
 use crate::id::{ActionId, InputId, NodeId, OutputId, SlotId, ValueId};
-use crate::program::{ActionKind, NetworkInput, NodeKind, Program};
+use crate::program::{ActionKind, NodeKind, Program};
 use crate::queue::EventQueue;
 use crate::tag::{Delay, Tag};
 use crate::time::{Duration, LogicalTime, PhysicalTime};
@@ -427,19 +427,27 @@ impl Timeline {
         self.state.enqueue(tag, action, value)
     }
 
+    /// The tag at which a message for `input` with `tag` is due: its own, or a microstep after the last one's when they
+    /// collide on a delayed connection.
+    #[inline]
+    #[must_use]
+    pub fn due(&self, input: InputId, tag: Tag) -> Tag {
+        let last = self.state.inputs[input.index()].last;
+        if self.program.inputs[input.index()].delayed && tag <= last {
+            last.next_microstep().unwrap_or(Tag::FOREVER)
+        } else {
+            tag
+        }
+    }
+
     /// Takes a message from another federate for `input` with the tag it carries.
     ///
     /// Over a delayed connection the n-th message for one tag goes n-1 microsteps later, in the order of the connection.
     /// Tardy ones go to the next free microsteps after the current tag.
     pub fn admit(&mut self, input: InputId, tag: Tag, value: ValueId) -> Admission {
-        let NetworkInput {
-            action, delayed, ..
-        } = self.program.inputs[input.index()];
+        let due = self.due(input, tag);
+        let action = self.program.inputs[input.index()].action;
         let status = &mut self.state.inputs[input.index()];
-        let mut due = tag;
-        if delayed && due <= status.last {
-            due = status.last.next_microstep().unwrap_or(Tag::FOREVER);
-        }
         status.last = status.last.max(due);
         if due > self.state.at {
             return Admission::Queued {

@@ -153,7 +153,10 @@ impl Peers {
 
     /// Bytes that wait to be written, of the fullest connection.
     pub(crate) fn backlog(&self, federate: &mut Federate) -> usize {
-        let lengths = self.connections.iter().map(|p| federate.peer_output(p.stream).len());
+        let lengths = self
+            .connections
+            .iter()
+            .map(|p| federate.peer_output(p.stream).len());
         lengths.max().unwrap_or(0)
     }
 

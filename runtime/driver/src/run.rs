@@ -14,8 +14,8 @@ use crate::peers::Peers;
 use crate::status::Status;
 use crate::transport::{self, Awaited, Connection, Signals, Waker};
 use ictus_coord::federate::{Federate, FederateConfig, FederateEvent, LinkConfig, Outcome, Poll};
-use ictus_coord::plan::Plan;
 use ictus_coord::measure::LagNews;
+use ictus_coord::plan::Plan;
 use ictus_coord::report::{FederateStatus, exit};
 use ictus_core::{Duration, PhysicalTime, Tag};
 use std::io::{self, Write};
@@ -342,7 +342,9 @@ impl Runner<'_> {
         if let Some(connection) = &self.io.connection {
             let here = connection.local().map_err(RunError::Io)?;
             let peers = &mut self.io.peers;
-            peers.listen(here.ip(), &mut self.federate).map_err(RunError::Io)?;
+            peers
+                .listen(here.ip(), &mut self.federate)
+                .map_err(RunError::Io)?;
         }
         Ok(())
     }
@@ -494,7 +496,10 @@ impl Runner<'_> {
                     peers.connect(&mut self.federate, now, peer, (address, port));
                 }
                 FederateEvent::PeerRefused(words) => {
-                    drop(writeln!(io::stderr(), "ictus: federate {federate}: {words}"));
+                    drop(writeln!(
+                        io::stderr(),
+                        "ictus: federate {federate}: {words}"
+                    ));
                 }
                 FederateEvent::StpViolation {
                     upstream,

@@ -34,7 +34,10 @@ pub(crate) struct Connection {
 impl Connection {
     /// Connects once, with Nagle off: what is written is already a batch.
     pub(crate) fn open(address: SocketAddr, timeout: Duration) -> io::Result<Self> {
-        Self::of(TcpStream::connect_timeout(&address, timeout.to_std())?, address)
+        Self::of(
+            TcpStream::connect_timeout(&address, timeout.to_std())?,
+            address,
+        )
     }
 
     /// A connection that stands.
@@ -239,7 +242,10 @@ pub(crate) fn wait<'a>(
     });
     let mut fds = Vec::with_capacity(4);
     fds.push(PollFd::from_borrowed_fd(waker.0.as_fd(), PollFlags::IN));
-    fds.push(PollFd::from_borrowed_fd(signals.stream.as_fd(), PollFlags::IN));
+    fds.push(PollFd::from_borrowed_fd(
+        signals.stream.as_fd(),
+        PollFlags::IN,
+    ));
     fds.extend(awaited.filter_map(Awaited::poll_fd));
     let signal = match poll(&mut fds, timeout.as_ref()) {
         Ok(_) => !fds[1].revents().is_empty(),

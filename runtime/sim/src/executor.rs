@@ -34,6 +34,11 @@ pub trait SimulatedExecutor: FederateExecutor {
     /// Whether nothing has arrived at the current tag: a tag that is executed only because the RTI wants to know.
     fn quiet(&self) -> bool;
 
+    /// The tag at which the last tardy message is handled.
+    fn last_tardy(&self) -> Option<Tag> {
+        None
+    }
+
     /// Whether a reaction ran as tardy at `tag`.
     fn ran_tardy(&self, _tag: Tag) -> bool {
         true
@@ -81,6 +86,7 @@ pub struct SyntheticExecutor {
     trace: Vec<Record>,
     /// The tags at which reactions ran as tardy.
     tardy: BTreeSet<Tag>,
+    last_tardy: Option<Tag>,
     /// The stop tag's records of shutdown reactions are told apart.
     unstable: Option<NodeId>,
     payload: usize,
@@ -108,6 +114,7 @@ impl SyntheticExecutor {
             observed: vec![None; nodes],
             trace: Vec::new(),
             tardy: BTreeSet::new(),
+            last_tardy: None,
             unstable: None,
             payload,
             arrivals: 0,
@@ -344,6 +351,10 @@ impl FederateExecutor for SyntheticExecutor {
         };
         Ok(self.hold(u64::from_le_bytes(*bytes)))
     }
+
+    fn note_tardy(&mut self, _input: InputId, _intended: Tag, actual: Tag) {
+        self.last_tardy = Some(actual);
+    }
 }
 
 impl SimulatedExecutor for SyntheticExecutor {
@@ -372,6 +383,10 @@ impl SimulatedExecutor for SyntheticExecutor {
 
     fn quiet(&self) -> bool {
         self.arrivals == 0
+    }
+
+    fn last_tardy(&self) -> Option<Tag> {
+        self.last_tardy
     }
 
     fn ran_tardy(&self, tag: Tag) -> bool {

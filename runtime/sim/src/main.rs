@@ -110,7 +110,9 @@ fn check(
     mutants: Mutants,
     log: bool,
 ) -> (Option<Verdict>, Option<Violation>) {
-    match catch_unwind(AssertUnwindSafe(|| check_seed_logged(seed, kind, mutants, log))) {
+    match catch_unwind(AssertUnwindSafe(|| {
+        check_seed_logged(seed, kind, mutants, log)
+    })) {
         Ok(verdict) => {
             let violation = verdict.violation.clone();
             (Some(verdict), violation)
@@ -216,7 +218,10 @@ fn report(total: &mut Tally, kind: Kind, out: &mut impl Write) -> io::Result<boo
             Kind::Centralized => "",
             Kind::Decentralized => " --decentralized",
         };
-        writeln!(out, "reproduce: cargo sim{option} --seed {seed:#x}\n  {what}")?;
+        writeln!(
+            out,
+            "reproduce: cargo sim{option} --seed {seed:#x}\n  {what}"
+        )?;
     }
     let missing: Vec<_> = total.coverage.missing(kind).collect();
     // A handful of seeds cannot show everything.

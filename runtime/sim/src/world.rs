@@ -400,8 +400,7 @@ impl<E: SimulatedExecutor> World<E> {
         self.hosts[federate].die(now, lose, &mut self.wakes);
         self.wake_rti_for_arrivals();
         self.break_roads(federate, lose);
-        let at = self.hosts[federate].federate.timeline().at();
-        self.laws.differs_from(at);
+        self.end_of_faith();
         if !self.rti.knows(federate) {
             self.rti.give_up(now);
             self.wake_rti(now);
@@ -416,10 +415,7 @@ impl<E: SimulatedExecutor> World<E> {
         self.crashed = Some((self.now, Victim::Rti));
         self.observer.lose();
         self.rti.die();
-        // Each ends where it learns of it.
-        for host in &self.hosts {
-            self.laws.differs_from(host.federate.timeline().at());
-        }
+        self.end_of_faith();
         for federate in 0..self.hosts.len() {
             let lose = self.rng.percent(50);
             let now = self.now;

@@ -1,8 +1,8 @@
 //! The link to the RTI under centralized coordination: what is announced (NET, LTC), granted (TAG, PTAG) and sent.
 
+use super::peers::Peers;
 use crate::measure::Measures;
 use crate::mutants::{Mutant, Mutants};
-use super::peers::Peers;
 use crate::plan::{ClockSync, ConnectionPlan, Coordination, OnFailure, Plan, Wire};
 use crate::topology::{FederateId, Topology, connection_delay, zero_delay_cycle_inputs};
 use crate::wire::{self, NeighborStructure, PortAbsent, ToPeer, ToRti};
@@ -90,7 +90,8 @@ impl LinkConfig {
         let over_others = |f: &u16| {
             let via = topology.upstream(me).iter().map(|(u, _)| *u);
             let reaches = |u: FederateId| topology.sources(u).iter().any(|(s, _)| s.get() == *f);
-            via.into_iter().any(|u| u.get() != *f && u != me && reaches(u))
+            via.into_iter()
+                .any(|u| u.get() != *f && u != me && reaches(u))
         };
         let sources = topology.sources(me).iter().map(|(f, _)| f.get());
         let indirect_upstream = sources.filter(|f| !direct(f) || over_others(f)).collect();

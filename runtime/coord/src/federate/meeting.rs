@@ -15,7 +15,9 @@ impl Federate {
     /// [`Federate::connect`].
     #[must_use]
     pub fn expects_peers(&self) -> bool {
-        self.link.as_ref().is_some_and(|link| link.peers.expects_any())
+        self.link
+            .as_ref()
+            .is_some_and(|link| link.peers.expects_any())
     }
 
     /// Whether others are still to connect: if not, the driver stops listening and closes what has not said hello.

@@ -100,7 +100,10 @@ impl Peers {
         Self {
             me,
             wire,
-            senders: senders.into_iter().map(|peer| (peer, Sender::Missing)).collect(),
+            senders: senders
+                .into_iter()
+                .map(|peer| (peer, Sender::Missing))
+                .collect(),
             receivers: receivers.into_iter().map(way).collect(),
             ..Self::default()
         }
@@ -236,7 +239,8 @@ impl Peers {
         }
         match self.senders.iter_mut().find(|(peer, _)| *peer == federate) {
             None => {
-                let words = format!("federate {federate} wants to send here, which the plan does not say");
+                let words =
+                    format!("federate {federate} wants to send here, which the plan does not say");
                 Err((RejectReason::FederateIdOutOfRange, words))
             }
             Some((_, Sender::Here | Sender::Gone)) => {

@@ -162,7 +162,8 @@ impl Federate {
             limit
         };
         self.stop.limit = Some(self.stop.limit.map_or(limit, |earlier| earlier.min(limit)));
-        if let Some(link) = &mut self.link {
+        // What it sent to this federate itself may still be on its way: time decides.
+        if let Some(link) = self.link.as_mut().filter(|link| !link.config.decentralized) {
             link.settle_lost(federate, limit, &mut self.timeline);
         }
         if self.stop.lost.is_none() {
@@ -201,9 +202,7 @@ impl Federate {
         let stays = abandoned.is_none();
         let reached = match lost {
             Some(lost) => Outcome::PeerLost(lost),
-            None if self.stop.violated => {
-                Outcome::TooManyViolations(self.counters.stp_violations)
-            }
+            None if self.stop.violated => Outcome::TooManyViolations(self.counters.stp_violations),
             None => Outcome::Stopped,
         };
         self.outcome = Some(abandoned.unwrap_or(reached));

@@ -50,7 +50,9 @@ impl Link {
 impl Federate {
     /// Whether time and STP offsets decide here.
     pub(super) fn is_decentralized(&self) -> bool {
-        self.link.as_ref().is_some_and(|link| link.config.decentralized)
+        self.link
+            .as_ref()
+            .is_some_and(|link| link.config.decentralized)
     }
 
     /// The clock by which absence is decided: what had come by then has been ingested.
@@ -117,14 +119,13 @@ impl Federate {
         let input = link.config.inputs[message.input.index()];
         let known_by_order = !link.config.mutants.has(Mutant::OrderIgnored);
         self.counters.received += 1;
-        self.measures
-            .arrived(input.federate, message.payload.len());
+        self.measures.arrived(input.federate, message.payload.len());
         if self.stop.over(self.timeline.at()) {
             return Ok(());
         }
         let late = || now.since(message.tag.time.as_physical()) - input.stp_offset;
         if self.timeline.finished() {
-            if message.tag <= self.timeline.at() {
+            if self.timeline.due(message.input, message.tag) <= self.timeline.at() {
                 self.count_violation(message.input, late());
                 let after = self.timeline.at().successor();
                 executor.note_tardy(message.input, message.tag, after);
@@ -155,7 +156,11 @@ impl Federate {
             }
         }
         self.measures.slack(input.federate, by.since(now));
-        let origin = message.tag.time.as_physical().saturating_add(-delay(input.delay));
+        let origin = message
+            .tag
+            .time
+            .as_physical()
+            .saturating_add(-delay(input.delay));
         let arrival = now.since(origin.saturating_add(input.sender_offset));
         self.measures.arrival(input.federate, arrival);
         Ok(())

@@ -32,6 +32,8 @@ pub(super) struct Host<E> {
     received: Vec<u8>,
     /// Bytes of the federate's output that the observer has seen.
     shown: usize,
+    /// Polled without looking at what has come.
+    unlooked: bool,
     wake_at: Option<i64>,
     busy_until: i64,
     /// Nodes in flight, in the order in which they started.
@@ -78,6 +80,7 @@ impl<E: SimulatedExecutor> Host<E> {
             state: State::Waiting,
             received: Vec::new(),
             shown: 0,
+            unlooked: false,
             wake_at: None,
             busy_until: 0,
             in_flight: Vec::new(),
@@ -122,6 +125,7 @@ impl<E: SimulatedExecutor> Host<E> {
             return None;
         }
         let (at, executing) = (timeline.at(), timeline.current().is_some());
+        let tag = timeline.due(input, tag);
         Some(at > tag || (at == tag && (!executing || timeline.known(input) >= tag)))
     }
 
@@ -130,7 +134,8 @@ impl<E: SimulatedExecutor> Host<E> {
     pub(super) fn handled_tardy(&self, input: InputId, tag: Tag) -> Option<bool> {
         let timeline = self.federate.timeline();
         let read = timeline.program().triggers_reaction(input);
-        let executed = timeline.at() > tag || (timeline.at() == tag && timeline.current().is_none());
+        let executed =
+            timeline.at() > tag || (timeline.at() == tag && timeline.current().is_none());
         let ordinary = tag < timeline.stop_tag();
         (read && executed && ordinary).then(|| self.executor.ran_tardy(tag))
     }
@@ -244,8 +249,15 @@ impl<E: SimulatedExecutor> World<E> {
             self.wake(federate, busy);
             return;
         }
-        self.read(federate);
-        self.read_roads(federate);
+        // A real driver polls several times between two looks at its sockets.
+        let host = &mut self.hosts[federate];
+        host.unlooked = self.laws.decentralized && !host.unlooked && host.rng.percent(25);
+        if host.unlooked {
+            self.wake(federate, self.now);
+        } else {
+            self.read(federate);
+            self.read_roads(federate);
+        }
         // A correction of the clock comes before the next reading.
         self.take_events(federate);
         self.poll(federate);
@@ -298,6 +310,8 @@ impl<E: SimulatedExecutor> World<E> {
                 Poll::Wait(until) => {
                     self.write(federate);
                     self.wait(federate, until);
+                    let position = self.hosts[federate].position();
+                    self.check_prompt(federate, position);
                     break;
                 }
                 Poll::Ended => {
@@ -313,6 +327,7 @@ impl<E: SimulatedExecutor> World<E> {
         }
         let position = self.hosts[federate].position();
         self.observer.federate_ran(federate, position);
+        self.check_entry(federate, position);
         if self.conditions.swarm.mode.calm && !self.observer.has_zero_delay_cycle() {
             self.check_lateness(federate, position);
         }

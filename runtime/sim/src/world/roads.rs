@@ -9,6 +9,8 @@ use super::World;
 use crate::coverage::Feature;
 use crate::executor::SimulatedExecutor;
 use crate::network::{Arrival, Pipe};
+use crate::observer::Position;
+use crate::swarm::Ending;
 use ictus_coord::federate::PeerStream;
 use ictus_coord::plan::{Bounds, Coordination, Plan, Wire};
 use ictus_coord::topology::connection_delay;
@@ -29,8 +31,8 @@ pub(super) struct Road {
     arrived: Vec<u8>,
     /// Which of them came when: how many bytes, in true time.
     pieces: VecDeque<(usize, i64)>,
-    /// When the messages that are on their way were written.
-    written: VecDeque<i64>,
+    /// When the messages that are on their way were written, and their tags.
+    written: VecDeque<(i64, Tag)>,
     answers: Vec<u8>,
     ended: bool,
     told: bool,
@@ -44,8 +46,14 @@ struct Lane {
     offset: Duration,
     sender_offset: Duration,
     bounds: Option<Bounds>,
-    /// The tag that the last message was due at.
-    last: Tag,
+    absent_after: Duration,
+    /// Up to which tag messages and absences have told the status.
+    known: Tag,
+    /// The largest tag of a message or absence.
+    told: Tag,
+    /// The last tag whose beginning, and whose end, were looked at.
+    begun: Tag,
+    ended: Tag,
 }
 
 /// What the laws need to know.
@@ -84,7 +92,11 @@ impl Laws {
                     plan.federates[usize::from(c.from.federate)].stp_offset_ns,
                 ),
                 bounds: c.bounds,
-                last: Tag::NEVER,
+                absent_after: Duration::from_nanos(c.absent_after_ns),
+                known: Tag::NEVER,
+                told: Tag::NEVER,
+                begun: Tag::NEVER,
+                ended: Tag::NEVER,
             };
             next_input[receiver] += 1;
             lanes.insert((receiver, c.port_id), lane);
@@ -169,8 +181,13 @@ impl<E: SimulatedExecutor> World<E> {
             told: false,
         };
         if network.partitions > 0 && self.rng.percent(30) {
-            let from = self.now + self.rng.span(Duration::ZERO, Duration::from_millis(300)).as_nanos();
-            road.forward.partition(from, from + network.partition.as_nanos());
+            let from = self.now
+                + self
+                    .rng
+                    .span(Duration::ZERO, Duration::from_millis(300))
+                    .as_nanos();
+            road.forward
+                .partition(from, from + network.partition.as_nanos());
         }
         self.roads.push(road);
     }
@@ -244,8 +261,13 @@ impl<E: SimulatedExecutor> World<E> {
         let now = host.clock.reading(self.now);
         let decided = tagged.and_then(|message| {
             let lane = self.laws.lanes.get(&(receiver, message.port))?;
-            host.has_decided(lane.input, lane.due(message.tag))
+            host.has_decided(lane.input, message.tag)
         });
+        let told = match message {
+            ToPeer::TaggedMessage(message) => Some((message.port, message.tag)),
+            ToPeer::PortAbsent(absent) => Some((absent.port, absent.tag)),
+            ToPeer::Hello { .. } | ToPeer::Message(_) => None,
+        };
         let before = host.federate.counters().stp_violations;
         let (federate, executor) = (&mut host.federate, &mut host.executor);
         let used =
@@ -254,10 +276,19 @@ impl<E: SimulatedExecutor> World<E> {
             return false;
         }
         let counted = host.federate.counters().stp_violations > before;
-        let actual = host.federate.timeline().at().successor();
+        if let Some((port, tag)) = told
+            && let Some(lane) = self.laws.lanes.get_mut(&(receiver, port))
+        {
+            lane.told = lane.told.max(tag);
+            // After collisions a message decides a later microstep than its own.
+            let known = host.federate.timeline().known(lane.input);
+            let by_message = tagged.map_or(Tag::NEVER, |_| known);
+            lane.known = lane.known.max(tag).max(by_message);
+        }
+        let actual = host.executor.last_tardy();
         if let Some(message) = tagged {
             let trip = Trip {
-                written: road.written.pop_front().unwrap_or(arrived),
+                written: road.written.pop_front().map_or(arrived, |w| w.0),
                 arrived,
                 written_there: PhysicalTime::NEVER,
                 arrived_there: self.hosts[road.sender].clock.reading(arrived),
@@ -272,7 +303,7 @@ impl<E: SimulatedExecutor> World<E> {
             let tag = message.tag;
             self.laws.weigh(receiver, &message, trip);
             self.judge(receiver, port, tag, (decided, counted), trip);
-            if counted {
+            if counted && let Some(actual) = actual {
                 self.laws.tardy.push((receiver, port, actual));
             }
         }
@@ -290,10 +321,9 @@ impl<E: SimulatedExecutor> World<E> {
         (decided, counted): (Option<bool>, bool),
         trip: Trip,
     ) {
-        let Some(lane) = self.laws.lanes.get_mut(&(receiver, port)) else {
+        let Some(lane) = self.laws.lanes.get(&(receiver, port)) else {
             return;
         };
-        lane.last = lane.due(tag);
         let by = tag.time.as_physical().saturating_add(lane.offset);
         let coverage = &mut self.observer.coverage;
         if counted {
@@ -304,9 +334,8 @@ impl<E: SimulatedExecutor> World<E> {
         if let Some(decided) = decided
             && decided != counted
         {
-            let what = format!(
-                "message with {tag} for {receiver}: decided {decided}, counted {counted}"
-            );
+            let what =
+                format!("message with {tag} for {receiver}: decided {decided}, counted {counted}");
             self.observer.blame("stp exact", what);
         }
         if counted && trip.arrived_here <= by {
@@ -326,9 +355,9 @@ impl<E: SimulatedExecutor> World<E> {
             if road.sender == federate {
                 let host = &mut self.hosts[federate];
                 let out = host.federate.peer_output(road.at_sender);
-                let tagged = count_tagged(out);
+                let written = tags(out).into_iter().map(|tag| (self.now, tag));
+                road.written.extend(written);
                 self.observer.peer_wrote(federate, road.receiver, out);
-                road.written.extend(std::iter::repeat_n(self.now, tagged));
                 road.forward.write(self.now, out, &mut wakes);
                 out.clear();
                 if host.federate.peer_over(road.at_sender) {
@@ -369,6 +398,78 @@ impl<E: SimulatedExecutor> World<E> {
         self.wakes = wakes;
     }
 
+    /// A tag is begun when everything before it is known or was waited for, and ended when it is itself.
+    pub(super) fn check_entry(&mut self, federate: usize, position: Position) {
+        let host = &self.hosts[federate];
+        let clock = host.clock.reading(self.now);
+        let start = host.federate.timeline().start_tag();
+        // Who has lost the RTI or a peer leaves the stop tag half done.
+        let hurried = position.over && self.crashed.is_some();
+        let started = start != Tag::NEVER && position.at >= start && !hurried;
+        if !self.laws.decentralized || !started || host.federate.only_shutdown_left() {
+            return;
+        }
+        let mut wrong = None;
+        let (at, time) = (position.at, position.at.time.as_physical());
+        for ((_, port), lane) in self
+            .laws
+            .lanes
+            .range_mut((federate, 0)..=(federate, u16::MAX))
+        {
+            let begins = std::mem::replace(&mut lane.begun, at) != at;
+            let by = time.saturating_add(lane.offset);
+            if begins && lane.known < at.latest_earlier() && clock < by {
+                wrong = Some(format!(
+                    "{federate} began {at} at {clock:?}, port {port} until {by:?}"
+                ));
+            }
+            let ends = !position.executing && std::mem::replace(&mut lane.ended, at) != at;
+            // A tardy message decides its input where it is handled.
+            let ends = ends && !self.laws.tardy.contains(&(federate, *port, at));
+            let by = by.saturating_add(lane.absent_after);
+            if ends && lane.known < at && clock < by {
+                wrong = Some(format!(
+                    "{federate} ended {at} at {clock:?}, port {port} until {by:?}"
+                ));
+            }
+        }
+        if let Some(what) = wrong {
+            self.observer.blame("stp entry", what);
+        }
+    }
+
+    /// A federate that waits does so for something that may still come before its next tag.
+    pub(super) fn check_prompt(&mut self, federate: usize, position: Position) {
+        let undisturbed = self.conditions.swarm.ending == Ending::Timeout;
+        if !self.laws.decentralized || !undisturbed || position.executing || position.over {
+            return;
+        }
+        let host = &self.hosts[federate];
+        let clock = host.clock.reading(self.now);
+        let next = position.next;
+        if position.at == Tag::NEVER || next == Tag::FOREVER || clock < next.time.as_physical() {
+            return;
+        }
+        let mut lanes = self.laws.lanes.range((federate, 0)..=(federate, u16::MAX));
+        if lanes.all(|(_, lane)| lane.told >= next.latest_earlier()) {
+            let what = format!("{federate} waits before {next} at {clock:?}, though all is known");
+            self.observer.blame("stp prompt", what);
+        }
+    }
+
+    /// What is on its way to anybody may never be handled, and everybody stops somewhere: from now on runs may differ.
+    pub(super) fn end_of_faith(&mut self) {
+        for host in &self.hosts {
+            self.laws.differs_from(host.federate.timeline().at());
+        }
+        for index in 0..self.roads.len() {
+            let road = &mut self.roads[index];
+            let unsent = tags(self.hosts[road.sender].federate.peer_output(road.at_sender));
+            let lost = road.written.iter().map(|w| w.1).chain(unsent).min();
+            lost.into_iter().for_each(|tag| self.laws.differs_from(tag));
+        }
+    }
+
     /// The laws that can be told at the end only.
     pub(super) fn check_laws(&mut self) {
         if !self.laws.decentralized {
@@ -390,20 +491,10 @@ impl<E: SimulatedExecutor> World<E> {
             };
             let host = &self.hosts[receiver];
             if host.handled_tardy(lane.input, actual) == Some(false) {
-                let what = format!("federate {receiver} did not handle a tardy message at {actual}");
+                let what =
+                    format!("federate {receiver} did not handle a tardy message at {actual}");
                 self.observer.blame("stp handled", what);
             }
-        }
-    }
-}
-
-impl Lane {
-    /// The tag at which a message is due: a microstep later after a collision.
-    fn due(&self, tag: Tag) -> Tag {
-        if self.delay != Delay::None && tag <= self.last {
-            self.last.successor()
-        } else {
-            tag
         }
     }
 }
@@ -429,11 +520,14 @@ fn forget(pieces: &mut VecDeque<(usize, i64)>, mut length: usize) {
     }
 }
 
-fn count_tagged(mut bytes: &[u8]) -> usize {
-    let mut count = 0;
+/// The tags of the messages in these bytes.
+fn tags(mut bytes: &[u8]) -> Vec<Tag> {
+    let mut tags = Vec::new();
     while let Ok(Some((message, length))) = ToPeer::decode(bytes, Wire::V0_12, MAX_PAYLOAD) {
-        count += usize::from(matches!(message, ToPeer::TaggedMessage(_)));
+        if let ToPeer::TaggedMessage(message) = message {
+            tags.push(message.tag);
+        }
         bytes = &bytes[length..];
     }
-    count
+    tags
 }
