@@ -159,6 +159,9 @@ pub enum Outcome {
     /// The plan's limit of STP violations was reached: this federate stopped the federation.
     #[error("stopped the federation after {0} STP violations")]
     TooManyViolations(u64),
+    /// The RTI, or whoever listens at its address, has another federation id.
+    #[error("the RTI did not prove that it knows the federation id")]
+    RtiUnproven,
     /// The RTI said something that is not of the protocol.
     #[error("the RTI broke the protocol: {0}")]
     Protocol(#[from] ProtocolError),
@@ -401,7 +404,9 @@ impl Federate {
             Phase::Running => self.poll_until_explained(now, executor),
             Phase::Meeting => self.meet(now),
             Phase::Ended => Poll::Ended,
-            Phase::AwaitingAck | Phase::Synchronizing(_) => self.await_answer(now),
+            Phase::Authenticating(_) | Phase::AwaitingAck | Phase::Synchronizing(_) => {
+                self.await_answer(now)
+            }
             // The others may join as late as they like.
             Phase::Idle | Phase::AwaitingStart => Poll::Wait(None),
             Phase::Draining { since, .. } => self.drain(now, since),

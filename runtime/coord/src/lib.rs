@@ -1,5 +1,6 @@
 //! Federated coordination as state machines: wire codec, RTI, federate. Pure.
 
+pub mod auth;
 pub mod describe;
 pub mod federate;
 pub mod measure;

@@ -31,15 +31,19 @@
 //! says FAILED, starts the stop consensus, its last promise limits those downstream, and nobody is left hanging; a stop
 //! reply that is late kills nobody as long as all are alive.
 
-use std::collections::VecDeque;
+use std::collections::{BTreeSet, VecDeque};
+use std::net::{IpAddr, Ipv4Addr};
 
 use ictus_core::{Duration, PhysicalTime, Tag};
 
+use crate::auth::Nonce;
 use crate::mutants::Mutants;
 use crate::plan::Wire;
 use crate::topology::{FederateId, Topology};
 use crate::wire::{MAX_PAYLOAD, NeighborStructure, RejectReason, ToFederate};
 
+mod addresses;
+mod authenticate;
 mod dnet;
 mod flow;
 pub mod grant;
@@ -64,6 +68,11 @@ pub struct RtiConfig {
     pub federates: u16,
     /// Clock exchanges with each federate that asks for them while it joins; 0: none.
     pub clock_exchanges: u32,
+    /// Whether federates must prove that they know the federation id before they join.
+    pub authentication: bool,
+    /// The federates whose loss stops nobody: nothing comes from them any more, as if they had resigned. The exit code is 1
+    /// all the same, and before the start there is no going on without them.
+    pub continue_without: BTreeSet<u16>,
     /// The layout of ADDRESS_QUERY.
     pub wire: Wire,
     /// Whether DNETs are sent.
@@ -102,6 +111,8 @@ impl RtiConfig {
             federation: federation.to_owned(),
             federates,
             clock_exchanges: 0,
+            authentication: false,
+            continue_without: BTreeSet::new(),
             wire: Wire::V0_12,
             dnet: true,
             start_multiple: None,
@@ -133,6 +144,27 @@ impl ConnectionId {
     #[must_use]
     pub const fn from_index(index: usize) -> Self {
         Self(index)
+    }
+}
+
+/// A peer that has connected.
+#[derive(Clone, Debug)]
+pub struct Newcomer {
+    /// Its address, for people; where others reach the federate, when it is a socket address.
+    pub peer: String,
+    /// The RTI's address as the peer sees it, if known: told to it as the address of federates on the RTI's host.
+    pub local: Option<IpAddr>,
+    /// Random bytes of its own; without them it cannot authenticate.
+    pub nonce: Option<Nonce>,
+}
+
+impl From<String> for Newcomer {
+    fn from(peer: String) -> Self {
+        Self {
+            peer,
+            local: None,
+            nonce: None,
+        }
     }
 }
 
@@ -225,8 +257,12 @@ pub struct Rti {
     topology: Topology,
     touched: Touched,
     stop: Stop,
-    /// Whether a federate was lost, so that the exit code is 1 and silence is bounded.
+    /// Whether a federate was lost, so that the exit code is 1.
+    failed: bool,
+    /// Whether one was lost that the others do not go on without, so that silence is bounded.
     lost: bool,
+    /// Whether nobody needs grants, as far as it shows: no federate has told a neighbour, and some listen for peers.
+    ungranted: bool,
     /// The last time a running federate said anything.
     last_word: PhysicalTime,
     /// The largest round trip measured while joining.
@@ -252,6 +288,8 @@ enum Phase {
 struct Connection {
     link: Link,
     peer: String,
+    local: Option<IpAddr>,
+    nonce: Option<Nonce>,
     output: Output,
     /// Whether it stands in [`Rti::outputs`].
     queued: bool,
@@ -263,7 +301,10 @@ enum Link {
     /// The slot is unused.
     Free,
     /// Nobody yet; closed at the deadline.
-    Unknown { deadline: PhysicalTime },
+    Unknown {
+        deadline: PhysicalTime,
+        hello: Hello,
+    },
     /// This federate.
     Member(FederateId),
     /// To be closed: what it sends is thrown away; closed by us at the deadline. A stranger never was a federate: the
@@ -272,6 +313,17 @@ enum Link {
         deadline: PhysicalTime,
         stranger: bool,
     },
+}
+
+/// How far a newcomer's authentication is.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Hello {
+    /// It has said nothing.
+    Silent,
+    /// This federate, as it says, was sent RTI_RESPONSE.
+    Challenged { federate: u16 },
+    /// It has proved that it knows the federation id.
+    Proven { federate: u16 },
 }
 
 /// One federate's connection and how far its join is.
@@ -284,8 +336,12 @@ struct Member {
     /// CAPABILITIES, once it has sent them.
     capabilities: Option<u32>,
     neighbors: NeighborStructure,
-    /// Where it listens for peers, as it advertised.
-    listener: Option<i32>,
+    /// Whether its last message was ADDRESS_QUERY.
+    queried: bool,
+    /// The port at which it listens for peers, as it advertised.
+    listener: Option<u16>,
+    /// Where peers reach it, when it has said so.
+    data_address: Option<Ipv4Addr>,
     /// Tags of messages on their way to it and not covered by its LTC: ascending, distinct.
     in_transit: VecDeque<Tag>,
     /// The last DNET sent to it.
@@ -336,7 +392,9 @@ impl Rti {
             topology: Topology::default(),
             touched: Touched::new(federates),
             stop: Stop::None,
+            failed: false,
             lost: false,
+            ungranted: false,
             last_word: PhysicalTime::NEVER,
             round_trip: Duration::ZERO,
             outputs: VecDeque::new(),
@@ -348,12 +406,16 @@ impl Rti {
 
     /// A peer has connected. It is refused at once when the federation has started.
     #[must_use]
-    pub fn connect(&mut self, now: PhysicalTime, peer: String) -> ConnectionId {
+    pub fn connect(&mut self, now: PhysicalTime, newcomer: impl Into<Newcomer>) -> ConnectionId {
         self.advance_to(now);
+        let Newcomer { peer, local, nonce } = newcomer.into();
         let deadline = self.now + self.config.handshake_timeout;
+        let hello = Hello::Silent;
         let connection = Connection {
-            link: Link::Unknown { deadline },
+            link: Link::Unknown { deadline, hello },
             peer,
+            local,
+            nonce,
             output: Output::new(),
             queued: false,
         };
@@ -386,7 +448,7 @@ impl Rti {
             let rest = &bytes[at..];
             let consumed = match self.connections[id.0].link {
                 Link::Free | Link::Closing { .. } => rest.len(),
-                Link::Unknown { .. } => self.receive_hello(id, rest),
+                Link::Unknown { hello, .. } => self.receive_hello(id, hello, rest),
                 Link::Member(federate) => match self.members[federate.index()].stage {
                     Stage::Running => self.receive_running(federate, rest),
                     Stage::Absent
@@ -444,6 +506,12 @@ impl Rti {
             Phase::Ended { .. } => {}
         }
         self.end_if_alone();
+    }
+
+    /// Whether newcomers need a nonce.
+    #[must_use]
+    pub const fn authenticates(&self) -> bool {
+        self.config.authentication
     }
 
     /// The next connection whose output has changed; its chunks are to be written, its [`Closing`] obeyed.
@@ -559,7 +627,9 @@ impl Member {
                 upstream: Vec::new(),
                 downstream: Vec::new(),
             },
+            queried: false,
             listener: None,
+            data_address: None,
             in_transit: VecDeque::new(),
             sent_dnet: Tag::NEVER,
             known_dnet: Tag::NEVER,

@@ -7,7 +7,7 @@
 //!
 //! | Id | Message | Direction | Size | Body |
 //! | --- | --- | --- | --- | --- |
-//! | 0 | [`ToFederate::Reject`], [`FromPeer::Reject`] | R→F, P→P | 2 | reason u8 |
+//! | 0 | [`ToFederate::Reject`], [`ToRti::Reject`], [`FromPeer::Reject`] | both, P→P | 2 | reason u8 |
 //! | 1 | [`ToRti::FederateIds`] | F→R | 4+n | federate u16, n u8, federation id |
 //! | 2 | [`ToRti::Timestamp`], [`ToFederate::Timestamp`] | both | 9 | physical time; the start time |
 //! | 4 | [`ToRti::Resign`] | F→R | 1 | |
@@ -38,12 +38,13 @@
 //! | 200 | [`ToRti::Capabilities`] | F→R | 5 | bit set u32: [`capability`] |
 //! | 201 | [`ToFederate::DownstreamConfirmed`] | R→F | 13 | tag |
 //! | 202 | [`ToFederate::FederateLost`] | R→F | 15 | federate u16, tag |
+//! | 203 | [`ToRti::DataAddress`] | F→R | 9 | port i32, IPv4 in network order |
 //! | 254 | [`ToRti::UdpPort`] | F→R | 3 | port u16: 65535 no clock sync, 0 at start only, else continuous |
 //! | 255 | [`ToFederate::Ack`], [`FromPeer::Ack`] | R→F, P→P | 1 | |
 //!
-//! 200 to 202 are ours and pass only between our own peers. A federate sends CAPABILITIES once, right after UDP_PORT
+//! 200 to 203 are ours and pass only between our own peers. A federate sends CAPABILITIES once, right after UDP_PORT
 //! and only when its plan says that the RTI is ours; the RTI sends 201 only to a federate with
-//! [`capability::FLOW_CONTROL`] and 202 only to one with [`capability::FEDERATE_LOST`].
+//! [`capability::FLOW_CONTROL`] and 202 only to one with [`capability::FEDERATE_LOST`]. 203 comes after CAPABILITIES.
 //!
 //! Source: Lingua Franca, reactor-c `net_common.h`; sections 1 to 3 of the wire document.
 
@@ -62,7 +63,7 @@ pub const MAX_PAYLOAD: u32 = 64 << 20;
 
 /// The message types: the first byte of every message.
 pub mod kind {
-    /// REJECT, RTI to federate.
+    /// REJECT, RTI to federate; the other way only while they authenticate.
     pub const REJECT: u8 = 0;
     /// FED_IDS, federate to RTI.
     pub const FEDERATE_IDS: u8 = 1;
@@ -124,6 +125,8 @@ pub mod kind {
     pub const DOWNSTREAM_CONFIRMED: u8 = 201;
     /// FEDERATE_LOST, RTI to federate; ours.
     pub const FEDERATE_LOST: u8 = 202;
+    /// DATA_ADDRESS, federate to RTI; ours.
+    pub const DATA_ADDRESS: u8 = 203;
     /// UDP_PORT, federate to RTI.
     pub const UDP_PORT: u8 = 254;
     /// ACK, RTI to federate.
@@ -139,6 +142,9 @@ pub mod capability {
     /// The federate begins a tag as soon as nothing can come before it, and runs there what has all its inputs: it wants a
     /// TAG just before its NET when messages may still come at its NET.
     pub const RUNS_AHEAD: u32 = 4;
+    /// The federate needs no grants: it knows itself what a lost federate's messages may be missing from
+    /// ([`super::ToFederate::FederateLost`] promises nothing).
+    pub const DECENTRALIZED: u32 = 8;
 }
 
 /// The value of [`ToRti::UdpPort`] that asks for no clock synchronization at all.
@@ -263,6 +269,15 @@ pub enum ToRti<'a> {
     },
     /// What the federate understands beyond LF's protocol: [`capability`].
     Capabilities(u32),
+    /// Where this federate's peers reach it, when that is not the address it joins from.
+    DataAddress {
+        /// Its TCP port.
+        port: i32,
+        /// Its IPv4 address, in network order; 0.0.0.0: as the RTI sees it.
+        address: [u8; 4],
+    },
+    /// The federate refuses this RTI, which has not proved that it knows the federation id; its last message.
+    Reject(RejectReason),
 }
 
 /// A message from the RTI to a federate.
@@ -317,7 +332,8 @@ pub enum ToFederate<'a> {
         federate: u16,
         /// The last tag at which the *receiver* may still run ordinary reactions: at any later tag a message of the
         /// lost one could be missing. [`Tag::FOREVER`] when the lost one cannot reach the receiver. Grants may
-        /// pass it afterwards so that the stop tag is reached; only `shutdown` runs there.
+        /// pass it afterwards so that the stop tag is reached; only `shutdown` runs there. [`Tag::NEVER`], which says
+        /// nothing, to a receiver with [`capability::DECENTRALIZED`].
         promise: Tag,
     },
 }
@@ -412,6 +428,8 @@ impl<'a> ToRti<'a> {
             Self::FederateNonce { .. } => "FED_NONCE",
             Self::FederateResponse { .. } => "FED_RESPONSE",
             Self::Capabilities(_) => "CAPABILITIES",
+            Self::DataAddress { .. } => "DATA_ADDRESS",
+            Self::Reject(_) => "REJECT",
         }
     }
 
@@ -469,6 +487,12 @@ impl<'a> ToRti<'a> {
             }
             Self::Capabilities(bits) => {
                 w.u8(kind::CAPABILITIES).u32(*bits);
+            }
+            Self::DataAddress { port, address } => {
+                w.u8(kind::DATA_ADDRESS).i32(*port).bytes(address);
+            }
+            Self::Reject(reason) => {
+                w.u8(kind::REJECT).u8(reason.code());
             }
         }
     }
@@ -536,6 +560,13 @@ impl<'a> ToRti<'a> {
             }),
             kind::FEDERATE_RESPONSE => r.array().map(|hmac| Self::FederateResponse { hmac }),
             kind::CAPABILITIES => r.u32().map(Self::Capabilities),
+            kind::DATA_ADDRESS => r.i32().and_then(|port| {
+                let address = r.array()?;
+                Some(Self::DataAddress { port, address })
+            }),
+            kind::REJECT => r
+                .u8()
+                .map(|code| Self::Reject(RejectReason::from_code(code))),
             _ => return None,
         })
     }

@@ -2,8 +2,14 @@
 
 #![allow(clippy::unwrap_used, missing_docs, reason = "a test")]
 
-use ictus_coord::rti::{Closing, ConnectionId, Disconnect, Rti, RtiConfig};
-use ictus_coord::wire::{NO_CLOCK_SYNC, NeighborStructure, TaggedMessage, ToFederate, ToRti};
+use std::collections::BTreeSet;
+
+use ictus_coord::auth::Proof;
+use ictus_coord::plan::Wire;
+use ictus_coord::rti::{Closing, ConnectionId, Disconnect, Newcomer, Rti, RtiConfig};
+use ictus_coord::wire::{
+    NO_CLOCK_SYNC, NeighborStructure, RejectReason, TaggedMessage, ToFederate, ToRti,
+};
 use ictus_core::{Delay, Duration, LogicalTime, PhysicalTime, Tag};
 use proptest::collection::vec;
 use proptest::prelude::*;
@@ -35,7 +41,7 @@ fn message() -> impl Strategy<Value = Vec<u8>> {
     let federate = prop_oneof![4 => 0u16..3, 1 => any::<u16>()];
     let delay = (-1i64..5).prop_map(|nanos| Delay::after(Duration::from_nanos(nanos)));
     let neighbors = (vec((0u16..4, delay), 0..3), vec(0u16..4, 0..3));
-    (0..14u8, federate, tag(), neighbors, any::<i64>()).prop_map(
+    (0..19u8, federate, tag(), neighbors, any::<i64>()).prop_map(
         |(kind, federate, tag, (upstream, downstream), number)| {
             let mut bytes = Vec::new();
             let message = match kind {
@@ -62,6 +68,21 @@ fn message() -> impl Strategy<Value = Vec<u8>> {
                 10 => ToRti::Resign,
                 11 => ToRti::ClockSyncT3 { federate },
                 12 => ToRti::Capabilities(3),
+                13 => ToRti::AddressAdvertisement {
+                    port: i32::from(federate) - 1,
+                },
+                14 => ToRti::DataAddress {
+                    port: 7000,
+                    address: [127, 0, 0, 1],
+                },
+                15 => ToRti::FederateNonce {
+                    federate,
+                    nonce: [1; 8],
+                },
+                16 => ToRti::FederateResponse {
+                    hmac: Proof::Federate { nonce: [2; 8] }.sign(b"good"),
+                },
+                17 => ToRti::Reject(RejectReason::HmacWrong),
                 _ => ToRti::AddressQuery {
                     federate,
                     transient: None,
@@ -87,6 +108,10 @@ fn act() -> impl Strategy<Value = Act> {
     ]
 }
 
+fn wire() -> impl Strategy<Value = Wire> {
+    prop_oneof![Just(Wire::V0_12), Just(Wire::V0_13)]
+}
+
 /// A driver without sockets.
 struct Driver {
     rti: Rti,
@@ -95,9 +120,12 @@ struct Driver {
 }
 
 impl Driver {
-    fn new(federates: u16) -> Self {
+    fn new(federates: u16, authentication: bool, wire: Wire) -> Self {
         let config = RtiConfig {
             clock_exchanges: 1,
+            authentication,
+            wire,
+            continue_without: BTreeSet::from([1]),
             ..RtiConfig::new("good", federates)
         };
         Self {
@@ -108,7 +136,12 @@ impl Driver {
     }
 
     fn connect(&mut self) -> ConnectionId {
-        let id = self.rti.connect(self.now, "stranger".to_owned());
+        let newcomer = Newcomer {
+            peer: "192.0.2.1:4000".to_owned(),
+            local: None,
+            nonce: Some([2; 8]),
+        };
+        let id = self.rti.connect(self.now, newcomer);
         self.open.push((id, Vec::new()));
         id
     }
@@ -169,8 +202,8 @@ proptest! {
     #![proptest_config(ProptestConfig::with_cases(1000))]
 
     #[test]
-    fn nothing_makes_it_panic(acts in vec(act(), 0..60)) {
-        let mut driver = Driver::new(2);
+    fn nothing_makes_it_panic(acts in vec(act(), 0..60), authentication: bool, wire in wire()) {
+        let mut driver = Driver::new(2, authentication, wire);
         for act in &acts {
             driver.act(act);
         }
@@ -185,7 +218,7 @@ proptest! {
     fn strangers_do_not_touch_a_good_federation(
         noise in vec((any::<bool>(), vec(any::<u8>(), 0..60)), 0..12),
     ) {
-        let mut driver = Driver::new(1);
+        let mut driver = Driver::new(1, false, Wire::V0_12);
         let mut hello = Vec::new();
         ToRti::FederateIds { federate: 0, federation: b"good" }.encode(&mut hello);
         ToRti::NeighborStructure(NeighborStructure::default()).encode(&mut hello);

@@ -2,11 +2,11 @@
 //!
 //! A file holds scenarios, each headed by `== TITLE` and settings, one a line:
 //! `federates N`, `edge A -> B [after MS]`, `ours ID...` (sends CAPABILITIES), `ahead ID...` (and RUNS_AHEAD), `option dnet off`, `option clock K`,
-//! `option multiple MS`. A step is some input lines, `----`, and the expected lines up to the next blank one. Every
+//! `option multiple MS`, `option auth` (nonces are the connection's number), `option continue ID...`. A step is some input lines, `----`, and the expected lines up to the next blank one. Every
 //! input line is one read and one round:
 //!
 //! * `start`: all federates join in order; what they receive is not shown. Times are milliseconds after the start.
-//! * `connect NAME`; `NAME: MESSAGE; MESSAGE`; `NAME bytes HEX HEX`; `NAME eof`; `NAME reset`.
+//! * `connect NAME [from SOCKET-ADDRESS to ADDRESS]`; `NAME: MESSAGE; MESSAGE`; `NAME bytes HEX HEX`; `NAME eof`; `NAME reset`.
 //! * `wait MS`: time passes and deadlines are looked at. `stop`: a signal asks the RTI to stop.
 //!
 //! A tag is `10` (milliseconds), `10:1` (with a microstep), `10-` (the last tag before 10), FOREVER or NEVER.
@@ -16,11 +16,15 @@
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
+use std::net::{IpAddr, SocketAddrV4};
 use std::path::PathBuf;
 
-use ictus_coord::rti::{Closing, ConnectionId, Disconnect, Rti, RtiConfig, RtiEvent};
+use ictus_coord::auth::Proof;
+use ictus_coord::rti::{Closing, ConnectionId, Disconnect, Newcomer, Rti, RtiConfig, RtiEvent};
 use ictus_coord::topology::{FederateId, Topology};
-use ictus_coord::wire::{NO_CLOCK_SYNC, PortAbsent, TaggedMessage, ToFederate, ToRti};
+use ictus_coord::wire::{
+    NO_CLOCK_SYNC, PortAbsent, RejectReason, TaggedMessage, ToFederate, ToRti,
+};
 use ictus_core::{Delay, Duration, LogicalTime, PhysicalTime, Tag};
 
 const MS: i64 = 1_000_000;
@@ -40,6 +44,8 @@ struct World {
     /// Bytes of each connection that the RTI has not taken yet.
     unread: BTreeMap<String, Vec<u8>>,
     finished: bool,
+    /// Connections so far.
+    connected: u8,
 }
 
 impl World {
@@ -63,6 +69,10 @@ impl World {
                     ahead.extend(ids.iter().map(|id| id.parse::<u16>().unwrap()));
                 }
                 ["option", "dnet", "off"] => config.dnet = false,
+                ["option", "auth"] => config.authentication = true,
+                ["option", "continue", ref ids @ ..] => {
+                    config.continue_without = ids.iter().map(|id| id.parse().unwrap()).collect();
+                }
                 ["option", "clock", k] => config.clock_exchanges = k.parse().unwrap(),
                 ["option", "multiple", ms] => {
                     config.start_multiple = Some(Duration::from_millis(ms.parse().unwrap()));
@@ -81,6 +91,7 @@ impl World {
             connections: BTreeMap::new(),
             unread: BTreeMap::new(),
             finished: false,
+            connected: 0,
         }
     }
 
@@ -108,7 +119,13 @@ impl World {
                 self.start();
                 return String::new();
             }
-            ["connect", name] => self.connect(name),
+            ["connect", name] => {
+                let peer = format!("192.0.2.7:{}", 40000 + self.connections.len());
+                self.connect(name, &peer, None);
+            }
+            ["connect", name, "from", peer, "to", local] => {
+                self.connect(name, peer, Some(local.parse().unwrap()));
+            }
             ["stop"] => self.rti.request_stop(self.now),
             ["wait", ms] => {
                 self.now = self.now + Duration::from_millis(ms.parse().unwrap());
@@ -134,11 +151,15 @@ impl World {
         self.round()
     }
 
-    fn connect(&mut self, name: &str) {
-        let id = self.rti.connect(
-            self.now,
-            format!("192.0.2.7:{}", 40000 + self.connections.len()),
-        );
+    fn connect(&mut self, name: &str, peer: &str, local: Option<IpAddr>) {
+        let number = self.connected;
+        self.connected += 1;
+        let newcomer = Newcomer {
+            peer: peer.to_owned(),
+            local,
+            nonce: Some([number; 8]),
+        };
+        let id = self.rti.connect(self.now, newcomer);
         self.connections.insert(name.to_owned(), id);
     }
 
@@ -152,7 +173,7 @@ impl World {
     fn start(&mut self) {
         for id in 0..self.federates {
             let name = id.to_string();
-            self.connect(&name);
+            self.step(&format!("connect {name}"));
             let capabilities = if self.ahead.contains(&id) {
                 "CAPABILITIES 7; "
             } else if self.ours.contains(&id) {
@@ -264,17 +285,6 @@ impl World {
                 federate: name.parse().unwrap(),
             }
             .encode(out),
-            ["ADVERTISE", port] => {
-                ToRti::AddressAdvertisement {
-                    port: port.parse().unwrap(),
-                }
-                .encode(out);
-            }
-            ["ADDRESS_QUERY", id] => ToRti::AddressQuery {
-                federate: id.parse().unwrap(),
-                transient: None,
-            }
-            .encode(out),
             ["MSG", to, at] => {
                 let federate = to.parse().unwrap();
                 ToRti::TaggedMessage(TaggedMessage {
@@ -300,7 +310,7 @@ impl World {
             ["STOP_REPLY", at] => ToRti::StopRequestReply(tag(at)).encode(out),
             ["RESIGN"] => ToRti::Resign.encode(out),
             ["FAILED"] => ToRti::Failed.encode(out),
-            _ => panic!("unknown message `{message}`"),
+            _ => encode_set_up(&words, out),
         }
     }
 
@@ -361,13 +371,63 @@ impl World {
                 let [a, b, c, d] = address;
                 format!("ADDRESS {a}.{b}.{c}.{d}:{port}")
             }
-            ToFederate::RtiResponse { .. } => "RTI_RESPONSE".to_owned(),
+            ToFederate::RtiResponse { nonce, hmac } => {
+                let proves = |federate: &u16| {
+                    Proof::Rti {
+                        federate: *federate,
+                        nonce: [9; 8],
+                    }
+                    .verify(FEDERATION.as_bytes(), hmac)
+                };
+                let proven = (0..10).find(proves).expect("the RTI knows the key");
+                format!("RTI_RESPONSE {} {proven}", nonce[0])
+            }
             ToFederate::Failed => "FAILED".to_owned(),
             ToFederate::DownstreamConfirmed(tag) => format!("CONFIRMED {}", self.tell_tag(*tag)),
             ToFederate::FederateLost { federate, promise } => {
                 format!("LOST {federate} {}", self.tell_tag(*promise))
             }
         }
+    }
+}
+
+/// What a federate says before it joins, and to find its peers.
+fn encode_set_up(words: &[&str], out: &mut Vec<u8>) {
+    match *words {
+        ["ADVERTISE", port] => {
+            ToRti::AddressAdvertisement {
+                port: port.parse().unwrap(),
+            }
+            .encode(out);
+        }
+        ["DATA_ADDRESS", address] => {
+            let address: SocketAddrV4 = address.parse().unwrap();
+            ToRti::DataAddress {
+                port: address.port().into(),
+                address: address.ip().octets(),
+            }
+            .encode(out);
+        }
+        ["NONCE", federate] => ToRti::FederateNonce {
+            federate: federate.parse().unwrap(),
+            nonce: [9; 8],
+        }
+        .encode(out),
+        ["PROOF", number, key] => {
+            let nonce = [number.parse().unwrap(); 8];
+            let hmac = Proof::Federate { nonce }.sign(key.as_bytes());
+            ToRti::FederateResponse { hmac }.encode(out);
+        }
+        ["REJECT", code] => {
+            let reason = RejectReason::from_code(code.parse().unwrap());
+            ToRti::Reject(reason).encode(out);
+        }
+        ["ADDRESS_QUERY", id] => ToRti::AddressQuery {
+            federate: id.parse().unwrap(),
+            transient: None,
+        }
+        .encode(out),
+        _ => panic!("unknown message `{}`", words.join(" ")),
     }
 }
 

@@ -13,6 +13,7 @@ use crate::outside::OutsideEvent;
 use crate::peers::Peers;
 use crate::status::Status;
 use crate::transport::{self, Awaited, Connection, Signals, Waker};
+use ictus_coord::auth::Nonce;
 use ictus_coord::federate::{Federate, FederateConfig, FederateEvent, LinkConfig, Outcome, Poll};
 use ictus_coord::measure::LagNews;
 use ictus_coord::plan::Plan;
@@ -220,6 +221,7 @@ fn run_one(job: &Job<'_>, ids: &[u16], rti: Option<SocketAddr>) -> Result<u8, Ru
                 .federation_id
                 .clone()
                 .unwrap_or_else(default_federation);
+            link.authentication = job.plan.authentication.then(nonce).transpose()?;
             Federate::federated(program, config, link)
         }
         (Some(_) | None, _) => Federate::alone(program, config),
@@ -251,6 +253,13 @@ fn run_one(job: &Job<'_>, ids: &[u16], rti: Option<SocketAddr>) -> Result<u8, Ru
 /// LF's default on both sides.
 fn default_federation() -> String {
     "Unidentified Federation".to_owned()
+}
+
+/// Random bytes for the authentication.
+fn nonce() -> Result<Nonce, RunError> {
+    let mut nonce = Nonce::default();
+    getrandom::fill(&mut nonce).map_err(|error| RunError::Io(error.into()))?;
+    Ok(nonce)
 }
 
 fn connect(address: SocketAddr) -> Result<Connection, RunError> {
@@ -643,6 +652,7 @@ impl Runner<'_> {
             Some(
                 outcome @ (Outcome::Rejected(_)
                 | Outcome::NotJoined { .. }
+                | Outcome::RtiUnproven
                 | Outcome::RejectedByPeer { .. }),
             ) => (exit::NOT_JOINED, outcome.to_string()),
             Some(outcome @ Outcome::TooManyViolations(_)) => {

@@ -17,6 +17,7 @@ const DEFAULT_EXCHANGES: u32 = 10;
 const BLANK: &str = " ";
 /// A payload's length is a signed 32-bit number on the wire.
 const LONGEST_PAYLOAD: u32 = i32::MAX.cast_unsigned();
+const FEDERATE_IDS: &str = "ids of federates, below `-n`, with commas between them";
 /// A terabyte: no output queue is longer.
 const LARGEST_OUTPUT: u64 = 1 << 40;
 
@@ -29,12 +30,14 @@ Coordinates one federation; takes the options of Lingua Franca's RTI.
   -p, --port PORT               TCP port (default 15045; 0: any free one)
       --bind ADDRESS            address to listen on (default 127.0.0.1, for this host alone; LF's RTI:
                                 0.0.0.0, for all)
+  -a, --auth                    only federates join that prove to know the federation's id (HMAC)
   -c, --clock_sync off|init|initial|on [period NS] [exchanges-per-interval K]
                                 compare clocks while federates join (default off; `initial` and `on` are
                                 `init`)
   -d, --dnet_disabled           send no downstream next event tags
   -m, --start-time-multiple VALUE UNIT
                                 round the start time up to a multiple; units from ns to weeks
+      --continue ID[,ID]...     go on when one of these federates is lost: as if it had resigned
       --max-payload SIZE        the longest payload of one message, in bytes or with K, M or G
                                 (default 64M); a longer one fails its sender; Ictus programs
                                 themselves take no longer ones than 64M
@@ -148,8 +151,13 @@ impl Options {
                 return Ok(Command::Print(text));
             }
         }
-        if parser.options.config.federates == 0 {
+        let config = &parser.options.config;
+        if config.federates == 0 {
             return Err(UsageError::NumberMissing);
+        }
+        let stranger = config.continue_without.last();
+        if let Some(id) = stranger.filter(|&&id| id >= config.federates) {
+            return invalid("--continue", FEDERATE_IDS, id.to_string());
         }
         Ok(Command::Run(Box::new(parser.options)))
     }
@@ -176,6 +184,8 @@ impl Parser {
                 self.options.bind_is_default = false;
             }
             "-c" | "--clock_sync" => self.clock_sync(option)?,
+            "-a" | "--auth" => self.options.config.authentication = true,
+            "--continue" => self.continue_without(option)?,
             "-d" | "--dnet_disabled" => self.options.config.dnet = false,
             "-m" | "--start-time-multiple" => {
                 self.options.config.start_multiple = Some(self.multiple(option)?);
@@ -201,7 +211,6 @@ impl Parser {
                 return Ok(Some(format!("ictus rti {}", env!("CARGO_PKG_VERSION"))));
             }
             "-h" | "--help" => return Ok(Some(HELP.to_owned())),
-            "-a" | "--auth" => return unsupported(option, "there is no HMAC authentication"),
             "-tls" => return unsupported(option, "there is no TLS"),
             "-sst" => return unsupported(option, "there is no SST"),
             "-nt" => return unsupported(option, "there are no transient federates"),
@@ -268,6 +277,17 @@ impl Parser {
             number @ (0 | u16::MAX) => invalid(option, expected, number.to_string()),
             number => Ok(number),
         }
+    }
+
+    fn continue_without(&mut self, option: &str) -> Result<(), UsageError> {
+        let value = self.value(option)?;
+        for id in value.split(',') {
+            let Ok(id) = id.trim().parse() else {
+                return invalid(option, FEDERATE_IDS, value);
+            };
+            self.options.config.continue_without.insert(id);
+        }
+        Ok(())
     }
 
     fn clock_sync(&mut self, option: &str) -> Result<(), UsageError> {
@@ -423,6 +443,15 @@ mod tests {
     }
 
     #[test]
+    fn who_may_fail_and_who_joins() {
+        let options = parse("--continue 2,0 -n 3 --continue 1 -c off -a").unwrap();
+        assert!(options.config.continue_without.iter().eq(&[0, 1, 2]));
+        assert!(options.config.authentication);
+        let config = parse("-n 1").unwrap().config;
+        assert!(!config.authentication && config.continue_without.is_empty());
+    }
+
+    #[test]
     fn limits_are_sizes() {
         let sizes = |line: &str| {
             let config = parse(line).unwrap().config;
@@ -447,8 +476,12 @@ mod tests {
                 "`-c` takes off, init, initial or on, not `sometimes`",
             ),
             (
-                "-n 1 -a",
-                "`-a` is not supported: there is no HMAC authentication",
+                "-n 3 --continue 1,3",
+                "`--continue` takes ids of federates, below `-n`, with commas between them, not `3`",
+            ),
+            (
+                "-n 3 --continue 1,",
+                "`--continue` takes ids of federates, below `-n`, with commas between them, not `1,`",
             ),
             (
                 "-n 1 -nt 2",

@@ -4,7 +4,8 @@ use std::io::{self, Read};
 use std::net::SocketAddr;
 use std::time::{Duration, SystemTime};
 
-use ictus_coord::rti::{ConnectionId, Disconnect, Rti, RtiEvent};
+use ictus_coord::auth::Nonce;
+use ictus_coord::rti::{ConnectionId, Disconnect, Newcomer, Rti, RtiEvent};
 use ictus_core::PhysicalTime;
 use mio::net::{TcpListener, UnixStream};
 use mio::{Events, Interest, Poll, Token};
@@ -290,9 +291,15 @@ impl Server {
     }
 
     fn add(&mut self, mut stream: mio::net::TcpStream, peer: SocketAddr, now: PhysicalTime) {
-        let id = self.rti.connect(now, peer.to_string());
+        let nonce = self.rti.authenticates().then(nonce).transpose();
+        let newcomer = Newcomer {
+            peer: peer.to_string(),
+            local: stream.local_addr().ok().map(|address| address.ip()),
+            nonce: nonce.as_ref().ok().copied().flatten(),
+        };
+        let id = self.rti.connect(now, newcomer);
         let interest = Interest::READABLE | Interest::WRITABLE;
-        let ready = stream.set_nodelay(true).and_then(|()| {
+        let ready = nonce.and_then(|_| stream.set_nodelay(true)).and_then(|()| {
             keep_alive(&stream)?;
             self.poll
                 .registry()
@@ -398,6 +405,13 @@ fn lacks_descriptors(error: &io::Error) -> bool {
     error
         .raw_os_error()
         .is_some_and(|code| most.contains(&code))
+}
+
+/// Random bytes from the system.
+fn nonce() -> io::Result<Nonce> {
+    let mut nonce = Nonce::default();
+    getrandom::fill(&mut nonce)?;
+    Ok(nonce)
 }
 
 /// The host's clock.

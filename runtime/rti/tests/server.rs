@@ -3,11 +3,12 @@
 #![allow(clippy::unwrap_used, clippy::panic, missing_docs, reason = "a test")]
 
 use std::io::{BufRead, BufReader, Read, Write};
-use std::net::{Shutdown, SocketAddr, TcpListener, TcpStream};
+use std::net::{IpAddr, Ipv4Addr, Shutdown, SocketAddr, TcpListener, TcpStream, UdpSocket};
 use std::os::fd::AsRawFd;
 use std::thread::JoinHandle;
 use std::time::Duration;
 
+use ictus_coord::auth::Proof;
 use ictus_coord::wire::{
     NO_CLOCK_SYNC, NeighborStructure, RejectReason, TaggedMessage, ToFederate, ToRti,
 };
@@ -38,7 +39,12 @@ impl Running {
     }
 
     fn connect(&self) -> Peer {
-        let stream = TcpStream::connect(self.address).unwrap();
+        self.connect_to(self.address.ip())
+    }
+
+    fn connect_to(&self, address: impl Into<IpAddr>) -> Peer {
+        let address = SocketAddr::new(address.into(), self.address.port());
+        let stream = TcpStream::connect(address).unwrap();
         stream.set_read_timeout(Some(PATIENCE)).unwrap();
         stream.set_write_timeout(Some(PATIENCE)).unwrap();
         stream.set_nodelay(true).unwrap();
@@ -51,7 +57,20 @@ impl Running {
     /// Sends everything up to TIMESTAMP at once.
     fn join(&self, federate: u16, upstream: &[u16], downstream: &[u16]) -> Peer {
         let mut peer = self.connect();
-        peer.send(&[
+        peer.introduce(federate, upstream, downstream);
+        peer
+    }
+}
+
+struct Peer {
+    stream: TcpStream,
+    unread: Vec<u8>,
+}
+
+impl Peer {
+    /// Sends everything up to TIMESTAMP at once.
+    fn introduce(&mut self, federate: u16, upstream: &[u16], downstream: &[u16]) {
+        self.send(&[
             ToRti::FederateIds {
                 federate,
                 federation: b"test",
@@ -64,16 +83,8 @@ impl Running {
             ToRti::Capabilities(0),
             ToRti::Timestamp(PhysicalTime::from_nanos(1_000_000_000)),
         ]);
-        peer
     }
-}
 
-struct Peer {
-    stream: TcpStream,
-    unread: Vec<u8>,
-}
-
-impl Peer {
     fn send(&mut self, messages: &[ToRti<'_>]) {
         let mut bytes = Vec::new();
         for message in messages {
@@ -142,6 +153,35 @@ fn tell(message: &ToFederate<'_>) -> String {
     }
 }
 
+/// Authenticates with `key` as federate `id`; returns the RTI's nonce.
+fn authenticate(peer: &mut Peer, id: u16, key: &[u8]) -> [u8; 8] {
+    let nonce = [7; 8];
+    peer.send(&[ToRti::FederateNonce {
+        federate: id,
+        nonce,
+    }]);
+    let mut bytes = [0; 41];
+    peer.stream.read_exact(&mut bytes).unwrap();
+    let Ok(Some((
+        ToFederate::RtiResponse {
+            nonce: theirs,
+            hmac,
+        },
+        41,
+    ))) = ToFederate::decode(&bytes)
+    else {
+        panic!("{bytes:?} is no RTI_RESPONSE");
+    };
+    let proof = Proof::Rti {
+        federate: id,
+        nonce,
+    };
+    assert!(proof.verify(b"test", &hmac), "the RTI knows the key");
+    let hmac = Proof::Federate { nonce: theirs }.sign(key);
+    peer.send(&[ToRti::FederateResponse { hmac }]);
+    theirs
+}
+
 fn message(federate: u16, tag: Tag, payload: &[u8]) -> ToRti<'_> {
     ToRti::TaggedMessage(TaggedMessage {
         port: 0,
@@ -149,6 +189,89 @@ fn message(federate: u16, tag: Tag, payload: &[u8]) -> ToRti<'_> {
         tag,
         payload,
     })
+}
+
+#[test]
+fn only_those_who_know_the_federation_id_join() {
+    let mut options = Options::new("test", 1);
+    options.config.authentication = true;
+    let rti = serve(options);
+    let refused = format!("{:?}", ToFederate::Reject(RejectReason::HmacWrong));
+    let mut plain = rti.join(0, &[], &[]);
+    assert_eq!(plain.next().unwrap(), refused);
+    assert_eq!(plain.next(), None);
+    let mut wrong = rti.connect();
+    let first = authenticate(&mut wrong, 0, b"tests");
+    assert_eq!(wrong.next().unwrap(), refused);
+    assert_eq!(wrong.next(), None);
+    let mut right = rti.connect();
+    let second = authenticate(&mut right, 0, b"test");
+    assert_ne!(first, second, "a nonce is used once");
+    right.introduce(0, &[], &[]);
+    right.start();
+    right.resign();
+    assert_eq!(rti.ended(), 0);
+}
+
+/// An address of this host that is not a loopback one, if it has one.
+fn own_address() -> Ipv4Addr {
+    let socket = UdpSocket::bind((Ipv4Addr::UNSPECIFIED, 0)).unwrap();
+    // Nothing is sent: this asks which interface would be used.
+    match socket.connect((Ipv4Addr::new(198, 51, 100, 1), 9)) {
+        Ok(()) => match socket.local_addr().unwrap().ip() {
+            IpAddr::V4(address) => address,
+            IpAddr::V6(_) => Ipv4Addr::LOCALHOST,
+        },
+        Err(_) => Ipv4Addr::LOCALHOST,
+    }
+}
+
+#[test]
+fn a_federate_from_elsewhere_is_not_told_a_loopback_address() {
+    let mut options = Options::new("test", 2);
+    options.bind = Ipv4Addr::UNSPECIFIED.into();
+    let rti = serve(options);
+    let mut near = rti.connect_to(Ipv4Addr::LOCALHOST);
+    near.send(&[
+        ToRti::FederateIds {
+            federate: 0,
+            federation: b"test",
+        },
+        ToRti::AddressAdvertisement { port: 7000 },
+        ToRti::AddressQuery {
+            federate: 0,
+            transient: None,
+        },
+    ]);
+    assert_eq!(near.next().unwrap(), "Ack");
+    // The answer to itself says that it has been heard.
+    let told = |address: Ipv4Addr| {
+        let address = address.octets();
+        let reply = ToFederate::AddressQueryReply {
+            port: 7000,
+            address,
+        };
+        Some(format!("{reply:?}"))
+    };
+    assert_eq!(near.next(), told(Ipv4Addr::LOCALHOST));
+    let here = own_address();
+    let mut far = rti.connect_to(here);
+    far.send(&[
+        ToRti::FederateIds {
+            federate: 1,
+            federation: b"test",
+        },
+        ToRti::AddressQuery {
+            federate: 0,
+            transient: None,
+        },
+    ]);
+    assert_eq!(far.next().unwrap(), "Ack");
+    assert_eq!(far.next(), told(here));
+    drop(far);
+    near.wait_for("Failed");
+    drop(near);
+    assert_eq!(rti.ended(), 1);
 }
 
 #[test]

@@ -227,7 +227,9 @@ impl Observer {
             | ToRti::AddressAdvertisement { .. }
             | ToRti::FederateNonce { .. }
             | ToRti::FederateResponse { .. }
-            | ToRti::Capabilities(_) => {}
+            | ToRti::Capabilities(_)
+            | ToRti::DataAddress { .. }
+            | ToRti::Reject(_) => {}
         }
     }
 

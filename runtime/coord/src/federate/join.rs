@@ -2,8 +2,9 @@
 
 use super::link::Link;
 use super::{Federate, FederateEvent, Incoming, Outcome, Poll, ProtocolError};
+use crate::auth::{Nonce, Proof};
 use crate::payload::FederateExecutor;
-use crate::wire::{NO_CLOCK_SYNC, TaggedMessage, ToFederate, ToRti, capability};
+use crate::wire::{NO_CLOCK_SYNC, RejectReason, TaggedMessage, ToFederate, ToRti, capability};
 use ictus_core::{Duration, PhysicalTime, Tag};
 
 /// Round trips that scatter more than this say nothing: no correction is made. Source: section 4 of the wire document.
@@ -17,6 +18,8 @@ pub(super) const ANSWER_MAX: Duration = Duration::from_secs(60);
 pub(super) enum Phase {
     /// Made, not connected.
     Idle,
+    /// FED_NONCE sent.
+    Authenticating(Nonce),
     /// FED_IDS sent.
     AwaitingAck,
     /// Comparing clocks.
@@ -42,6 +45,7 @@ impl Phase {
     fn name(&self) -> &'static str {
         match self {
             Self::Idle => "not connected",
+            Self::Authenticating(_) => "waiting for the RTI to authenticate",
             Self::AwaitingAck => "waiting for the RTI to accept the join",
             Self::Synchronizing(_) => "comparing clocks",
             Self::Meeting => "connecting with other federates",
@@ -93,12 +97,43 @@ impl Federate {
     /// Begins to join: the first bytes for the RTI. A federate alone has nothing to say.
     pub fn connect(&mut self) {
         if let Some(link) = &mut self.link {
+            let federate = link.config.id;
+            if let Some(nonce) = link.config.authentication {
+                link.say(&ToRti::FederateNonce { federate, nonce });
+                self.phase = Phase::Authenticating(nonce);
+            } else {
+                self.identify();
+            }
+        }
+    }
+
+    fn identify(&mut self) {
+        if let Some(link) = &mut self.link {
             let federation = link.config.federation.clone();
             link.say(&ToRti::FederateIds {
                 federate: link.config.id,
                 federation: federation.as_bytes(),
             });
             self.phase = Phase::AwaitingAck;
+        }
+    }
+
+    /// RTI_RESPONSE: checks that the RTI knows the federation id, and proves that we do.
+    fn authenticate(&mut self, own: Nonce, nonce: Nonce, hmac: &[u8; 32]) {
+        let Some(link) = &mut self.link else { return };
+        let key = link.config.federation.as_bytes();
+        let rti = Proof::Rti {
+            federate: link.config.id,
+            nonce: own,
+        };
+        if rti.verify(key, hmac) {
+            let hmac = Proof::Federate { nonce }.sign(key);
+            link.say(&ToRti::FederateResponse { hmac });
+            self.identify();
+        } else {
+            link.say(&ToRti::Reject(RejectReason::HmacWrong));
+            self.outcome = Some(Outcome::RtiUnproven);
+            self.phase = Phase::Ended;
         }
     }
 
@@ -109,7 +144,7 @@ impl Federate {
             return Poll::Wait(Some(by));
         }
         let hint = match self.phase {
-            Phase::AwaitingAck => ": is an RTI listening there?",
+            Phase::Authenticating(_) | Phase::AwaitingAck => ": is an RTI listening there?",
             Phase::Synchronizing(_) => ": an RTI with `-c off` compares no clocks",
             Phase::Idle
             | Phase::Meeting
@@ -158,6 +193,11 @@ impl Federate {
             (Phase::Draining { .. } | Phase::Ended, _) => Ok(()),
             (_, ToFederate::Reject(reason)) => Err(Outcome::Rejected(*reason)),
             (Phase::Running, _) => self.handle_running(now, message, executor),
+            (Phase::Authenticating(own), ToFederate::RtiResponse { nonce, hmac }) => {
+                let own = *own;
+                self.authenticate(own, *nonce, hmac);
+                Ok(())
+            }
             (Phase::AwaitingAck, ToFederate::Ack) => {
                 self.introduce();
                 Ok(())
@@ -203,9 +243,14 @@ impl Federate {
             NO_CLOCK_SYNC
         }));
         if link.config.extensions {
-            link.say(&ToRti::Capabilities(
-                capability::FLOW_CONTROL | capability::FEDERATE_LOST | capability::RUNS_AHEAD,
-            ));
+            let always =
+                capability::FLOW_CONTROL | capability::FEDERATE_LOST | capability::RUNS_AHEAD;
+            let more = if link.config.decentralized {
+                capability::DECENTRALIZED
+            } else {
+                0
+            };
+            link.say(&ToRti::Capabilities(always | more));
         }
         match exchanges {
             Some(wanted) if wanted > 0 => {
@@ -334,6 +379,7 @@ impl Federate {
             Phase::Running => self.abandon(Outcome::RtiLost),
             Phase::Ended => {}
             Phase::Idle
+            | Phase::Authenticating(_)
             | Phase::AwaitingAck
             | Phase::Synchronizing(_)
             | Phase::Meeting

@@ -1,6 +1,7 @@
 //! The link to the RTI under centralized coordination: what is announced (NET, LTC), granted (TAG, PTAG) and sent.
 
 use super::peers::Peers;
+use crate::auth::Nonce;
 use crate::measure::Measures;
 use crate::mutants::{Mutant, Mutants};
 use crate::plan::{ClockSync, ConnectionPlan, Coordination, OnFailure, Plan, Wire};
@@ -25,6 +26,9 @@ pub struct LinkConfig {
     pub id: u16,
     /// The federation id, at most 255 bytes.
     pub federation: String,
+    /// When set, federate and RTI prove to each other that they know the federation id before it joins; random bytes, never
+    /// used before.
+    pub authentication: Option<Nonce>,
     /// Immediate upstreams with the least delay from each.
     pub upstream: Vec<(u16, Delay)>,
     /// Immediate downstreams.
@@ -60,7 +64,8 @@ pub struct LinkConfig {
 
 impl LinkConfig {
     /// The link of federate `id` of a plan; `inputs` and `outputs` are the indices into the plan's connections of its
-    /// network inputs and outputs, in the order of their ids. The federation id is the caller's to set.
+    /// network inputs and outputs, in the order of their ids. The federation id is the caller's to set, and the nonce when
+    /// the plan asks for authentication.
     ///
     /// # Panics
     ///
@@ -98,6 +103,7 @@ impl LinkConfig {
         Self {
             id,
             federation: String::new(),
+            authentication: None,
             upstream: neighbors.upstream,
             downstream: neighbors.downstream,
             inputs: inputs.iter().map(input).collect(),

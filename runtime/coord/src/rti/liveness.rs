@@ -52,7 +52,7 @@ impl Rti {
         self.connections
             .iter()
             .filter_map(|connection| match connection.link {
-                Link::Unknown { deadline } => Some(deadline),
+                Link::Unknown { deadline, .. } => Some(deadline),
                 Link::Closing { deadline, .. } if connection.output.closing() != Closing::Now => {
                     Some(deadline)
                 }
@@ -69,7 +69,7 @@ impl Rti {
     #[must_use]
     pub fn least_needed(&self) -> Option<ConnectionId> {
         let rank = |link: Link| match link {
-            Link::Unknown { deadline } => Some((false, deadline)),
+            Link::Unknown { deadline, .. } => Some((false, deadline)),
             Link::Closing {
                 deadline,
                 stranger: true,
@@ -87,7 +87,7 @@ impl Rti {
     fn check_connection(&mut self, id: ConnectionId) {
         let connection = &self.connections[id.0];
         match connection.link {
-            Link::Unknown { deadline } if deadline <= self.now => {
+            Link::Unknown { deadline, .. } if deadline <= self.now => {
                 let peer = connection.peer.clone();
                 let reason = format!("it said nothing for {}", self.config.handshake_timeout);
                 self.events.push_back(RtiEvent::Rejected { peer, reason });
@@ -143,8 +143,13 @@ impl Rti {
     fn grace_deadline(&self) -> Option<PhysicalTime> {
         match (&self.stop, self.phase) {
             (Stop::Agreed { since, .. }, Phase::Running { .. }) if self.lost => {
+                let limit = *since + self.config.stop_limit;
+                if self.ungranted {
+                    // Nobody says anything between the agreement and its end, on time or not.
+                    return Some(limit);
+                }
                 let silent = self.last_word.max(*since) + self.config.stop_grace;
-                Some(silent.min(*since + self.config.stop_limit))
+                Some(silent.min(limit))
             }
             _ => None,
         }
@@ -196,12 +201,17 @@ impl Rti {
             return;
         }
         self.events.push_back(RtiEvent::Lost { federate, reason });
-        self.lost = true;
+        self.failed = true;
         let Phase::Running { start } = self.phase else {
             self.members[federate.index()].stage = Stage::Gone;
             self.abort_all();
             return;
         };
+        if self.config.continue_without.contains(&federate.get()) {
+            self.go_on_without(federate);
+            return;
+        }
+        self.lost = true;
         // What was still to reach it would have made it send, whatever it had announced.
         let view = self.view(LostRule::Limits, start);
         let next_event = view
@@ -211,14 +221,25 @@ impl Rti {
         let confirmed = standing.completed.next_microstep().unwrap_or(Tag::NEVER);
         standing.next_event = next_event.max(confirmed);
         self.detach(federate, Presence::Lost);
-        // Nothing passes through it any more: a cycle over it would wait for itself.
+        self.cut_off(federate);
+        self.tell_lost(federate);
+        self.begin_stop();
+        self.renew_stop_deadline();
+    }
+
+    /// The others take its silence for absence, as if it had resigned.
+    fn go_on_without(&mut self, federate: FederateId) {
+        self.detach(federate, Presence::Resigned);
+        self.standings[federate.index()].next_event = Tag::FOREVER;
+        self.cut_off(federate);
+    }
+
+    /// Nothing passes through a lost federate any more: a cycle over it would wait for itself.
+    fn cut_off(&mut self, federate: FederateId) {
         self.members[federate.index()].neighbors.upstream.clear();
         self.topology = self.told_topology();
         self.touched.next_event(federate);
         self.touched.completed(federate);
-        self.tell_lost(federate);
-        self.begin_stop();
-        self.renew_stop_deadline();
     }
 
     fn tell_lost(&mut self, lost: FederateId) {
@@ -227,7 +248,11 @@ impl Rti {
             if self.is_present(federate) && self.has_capability(federate, capability::FEDERATE_LOST)
             {
                 let path = self.topology.path(lost, federate);
-                let promise = path.map_or(Tag::FOREVER, |path| promise_over(next_event, path));
+                let promise = if self.has_capability(federate, capability::DECENTRALIZED) {
+                    Tag::NEVER
+                } else {
+                    path.map_or(Tag::FOREVER, |path| promise_over(next_event, path))
+                };
                 self.send(
                     federate,
                     &ToFederate::FederateLost {
@@ -288,7 +313,7 @@ impl Rti {
         if matches!(self.phase, Phase::Ended { .. }) {
             return;
         }
-        self.lost = true;
+        self.failed = true;
         for federate in self.federates() {
             self.send(federate, &ToFederate::Failed);
             if self.members[federate.index()].stage != Stage::Gone {
@@ -308,7 +333,7 @@ impl Rti {
         {
             return;
         }
-        let code = if self.lost { exit::FAILED } else { exit::OK };
+        let code = if self.failed { exit::FAILED } else { exit::OK };
         self.phase = Phase::Ended { code };
         self.events.push_back(RtiEvent::Ended { code });
         for index in 0..self.connections.len() {

@@ -125,8 +125,9 @@ impl Rti {
             ToRti::StopRequestReply(tag) => self.record_stop_reply(from, *tag),
             ToRti::Resign => self.resign(from),
             ToRti::Failed => self.lose_in_order(from),
-            ToRti::AddressAdvertisement { port } => {
-                self.members[from.index()].listener = Some(*port);
+            ToRti::AddressAdvertisement { port } => self.take_listener(from, *port),
+            ToRti::DataAddress { port, address } => {
+                self.take_data_address(from, *port, (*address).into());
             }
             ToRti::AddressQuery { federate, .. } => self.answer_query(from, *federate),
             ToRti::TaggedMessage(_)
@@ -137,7 +138,8 @@ impl Rti {
             | ToRti::ClockSyncT3 { .. }
             | ToRti::FederateNonce { .. }
             | ToRti::FederateResponse { .. }
-            | ToRti::Capabilities(_) => {
+            | ToRti::Capabilities(_)
+            | ToRti::Reject(_) => {
                 self.fail(
                     from,
                     format!("{} was not expected while running", message.name()),

@@ -1,10 +1,8 @@
 //! Joining: who a connection is, clock exchanges, and the start time.
 
-use std::net::{Ipv4Addr, SocketAddr};
-
 use ictus_core::{Delay, Duration, LogicalTime, PhysicalTime, Tag};
 
-use super::{ConnectionId, Link, Phase, Rti, RtiEvent, Stage};
+use super::{ConnectionId, Hello, Link, Member, Phase, Rti, RtiEvent, Stage};
 use crate::mutants::Mutant;
 use crate::topology::{FederateId, Topology};
 use crate::wire::{
@@ -21,46 +19,69 @@ const DELAY_PER_FEDERATE: Duration = Duration::from_millis(1);
 const LATEST_PROPOSAL: PhysicalTime = PhysicalTime::from_nanos(i64::MAX / 2);
 
 impl Rti {
-    /// The first message of a connection: FED_IDS or a refusal.
-    pub(super) fn receive_hello(&mut self, id: ConnectionId, bytes: &[u8]) -> usize {
-        match bytes[0] {
-            kind::FEDERATE_IDS => {}
-            kind::P2P_FEDERATE_ID | kind::P2P_TAGGED_MESSAGE => {
-                self.reject(
-                    id,
-                    RejectReason::WrongServer,
-                    "a federate's hello to another federate",
-                );
-                return bytes.len();
-            }
-            kind::FEDERATE_NONCE => {
-                let words = "it wants authentication, which this RTI does not do";
-                self.reject(id, RejectReason::NotAuthenticating, words);
-                return bytes.len();
-            }
-            byte => {
-                let words = format!("its first message has type {byte}, not FED_IDS");
-                self.reject(id, RejectReason::UnexpectedMessage, &words);
-                return bytes.len();
-            }
+    /// A message of a connection that is nobody yet: FED_IDS, what authenticates it before, or a refusal.
+    pub(super) fn receive_hello(&mut self, id: ConnectionId, hello: Hello, bytes: &[u8]) -> usize {
+        if let Some((reason, words)) = self.refusal(hello, bytes[0]) {
+            self.reject(id, reason, &words);
+            return bytes.len();
         }
-        match ToRti::decode(bytes) {
-            Ok(Some((
+        let Ok(Some((message, consumed))) = ToRti::decode(bytes) else {
+            return 0;
+        };
+        match (hello, message) {
+            (
+                Hello::Silent | Hello::Proven { .. },
                 ToRti::FederateIds {
                     federate,
                     federation,
                 },
-                consumed,
-            ))) => {
-                self.identify(id, federate, federation);
-                consumed
-            }
-            _ => 0,
+            ) => self.identify(id, hello, (federate, federation)),
+            (_, message) => self.authenticate(id, hello, &message),
         }
+        consumed
     }
 
-    fn identify(&mut self, id: ConnectionId, federate: u16, federation: &[u8]) {
-        let refusal = if federation != self.config.federation.as_bytes() {
+    /// Why a message of this type may not be next.
+    fn refusal(&self, hello: Hello, first: u8) -> Option<(RejectReason, String)> {
+        let (reason, words) = match (hello, first) {
+            (_, kind::P2P_FEDERATE_ID | kind::P2P_TAGGED_MESSAGE) => (
+                RejectReason::WrongServer,
+                "a federate's hello to another federate",
+            ),
+            (Hello::Proven { .. }, kind::FEDERATE_IDS) => return None,
+            (_, kind::FEDERATE_IDS) if self.config.authentication => (
+                RejectReason::HmacWrong,
+                "it does not authenticate, which this RTI asks for",
+            ),
+            (_, kind::FEDERATE_IDS) => return None,
+            (_, kind::FEDERATE_NONCE) if !self.config.authentication => (
+                RejectReason::NotAuthenticating,
+                "it wants authentication, which this RTI does not do",
+            ),
+            (Hello::Silent, kind::FEDERATE_NONCE)
+            | (Hello::Challenged { .. }, kind::FEDERATE_RESPONSE | kind::REJECT) => return None,
+            (Hello::Silent, byte) => {
+                let words = format!("its first message has type {byte}, not FED_IDS");
+                return Some((RejectReason::UnexpectedMessage, words));
+            }
+            (Hello::Challenged { .. } | Hello::Proven { .. }, byte) => {
+                let words = format!("a message of type {byte} while it authenticates");
+                return Some((RejectReason::UnexpectedMessage, words));
+            }
+        };
+        Some((reason, words.to_owned()))
+    }
+
+    fn identify(&mut self, id: ConnectionId, hello: Hello, (federate, federation): (u16, &[u8])) {
+        let other = match hello {
+            Hello::Proven { federate: proven } => Some(proven).filter(|&proven| proven != federate),
+            Hello::Silent | Hello::Challenged { .. } => None,
+        };
+        let refusal = if let Some(other) = other {
+            let words =
+                format!("it authenticated as federate {other}, and says that it is {federate}");
+            Some((RejectReason::HmacWrong, words))
+        } else if federation != self.config.federation.as_bytes() {
             Some((
                 RejectReason::FederationId,
                 format!("it names federation `{}`", printable(federation)),
@@ -105,7 +126,10 @@ impl Rti {
     }
 
     fn handle_joining(&mut self, federate: FederateId, message: ToRti<'_>) {
-        self.members[federate.index()].last_word = self.now;
+        let member = &mut self.members[federate.index()];
+        member.last_word = self.now;
+        let query = matches!(message, ToRti::AddressQuery { .. });
+        let queried = std::mem::replace(&mut member.queried, query);
         match (self.members[federate.index()].stage, message) {
             (Stage::Identified, ToRti::NeighborStructure(neighbors)) => {
                 self.take_structure(federate, neighbors);
@@ -121,8 +145,9 @@ impl Rti {
             (Stage::Synchronized { exchanged }, ToRti::Timestamp(time)) => {
                 self.take_proposal(federate, time, exchanged);
             }
-            (_, ToRti::AddressAdvertisement { port }) => {
-                self.members[federate.index()].listener = Some(port);
+            (_, ToRti::AddressAdvertisement { port }) => self.take_listener(federate, port),
+            (_, ToRti::DataAddress { port, address }) => {
+                self.take_data_address(federate, port, address.into());
             }
             (
                 _,
@@ -134,7 +159,11 @@ impl Rti {
             (_, ToRti::Resign) => self.fail(federate, "it resigned before the start".to_owned()),
             (_, message) => {
                 let name = message.name();
-                self.fail(federate, format!("{name} was not expected while joining"));
+                let hint = self.layout_hint(queried, &message);
+                self.fail(
+                    federate,
+                    format!("{name} was not expected while joining{hint}"),
+                );
             }
         }
     }
@@ -202,25 +231,6 @@ impl Rti {
         self.members[federate.index()].stage = Stage::Proposed { time, exchanged };
     }
 
-    pub(super) fn answer_query(&mut self, federate: FederateId, asked: u16) {
-        let asked = self.members.get(usize::from(asked));
-        let port = asked.and_then(|member| member.listener).unwrap_or(-1);
-        let peer = asked
-            .and_then(|member| member.connection)
-            .and_then(|id| self.connections[id.0].peer.parse::<SocketAddr>().ok());
-        let address = match peer {
-            Some(SocketAddr::V4(address)) => *address.ip(),
-            Some(SocketAddr::V6(_)) | None => Ipv4Addr::UNSPECIFIED,
-        };
-        self.send(
-            federate,
-            &ToFederate::AddressQueryReply {
-                port,
-                address: address.octets(),
-            },
-        );
-    }
-
     /// When all have proposed a start time: agrees on one and tells it.
     pub(super) fn start_if_complete(&mut self) {
         let Some(latest) = self.latest_proposal() else {
@@ -228,6 +238,9 @@ impl Rti {
         };
         let start = round_up(latest + self.start_delay(), self.config.start_multiple);
         self.topology = self.told_topology();
+        let told = |member: &Member| member.neighbors != NeighborStructure::default();
+        self.ungranted = !self.members.iter().any(told)
+            && self.members.iter().any(|member| member.listener.is_some());
         self.phase = Phase::Running {
             start: Tag::new(start.as_logical(), 0),
         };

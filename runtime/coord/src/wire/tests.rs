@@ -79,6 +79,8 @@ fn to_rti_owned() -> impl Strategy<Value = ToRti<'static>> {
             .prop_map(|(federate, nonce)| ToRti::FederateNonce { federate, nonce }),
         any::<[u8; 32]>().prop_map(|hmac| ToRti::FederateResponse { hmac }),
         any::<u32>().prop_map(ToRti::Capabilities),
+        any::<(i32, [u8; 4])>().prop_map(|(port, address)| ToRti::DataAddress { port, address }),
+        any::<u8>().prop_map(|code| ToRti::Reject(RejectReason::from_code(code))),
     ]
 }
 
