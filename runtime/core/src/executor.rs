@@ -14,6 +14,11 @@ pub trait Executor {
     /// Makes an action, or the slot it fills, present with a value scheduled earlier.
     fn arrive(&mut self, action: ActionId, slot: Option<SlotId>, value: ValueId);
 
+    /// Lets go of a value scheduled earlier: the policy of the action's spacing dropped or replaced it.
+    fn release(&mut self, action: ActionId, value: ValueId) {
+        let _ = (action, value);
+    }
+
     /// Runs one node and adds what it did to `effects`.
     ///
     /// For a user reaction: its body or deadline handler. For a forwarder: copies the slot's value to the

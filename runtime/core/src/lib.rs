@@ -18,7 +18,7 @@ pub use graph::BitSet;
 pub use id::{ActionId, InputId, NodeId, OutputId, PortId, ReactorId, SlotId, ValueId};
 pub use program::{
     ActionKind, NetworkInput, NodeKind, PortKind, Program, ProgramBuilder, ProgramError, Reaction,
-    ReactionSpec, Trigger,
+    ReactionSpec, Spacing, SpacingPolicy, Trigger,
 };
 pub use tag::{Delay, Tag};
 pub use time::{Duration, DurationExt, LogicalTime, ParseDurationError, PhysicalTime};

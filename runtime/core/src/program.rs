@@ -26,13 +26,15 @@ pub enum ActionKind {
     Logical {
         /// Added to every delay; a total of zero is one microstep.
         min_delay: Duration,
+        /// How far events are kept apart.
+        spacing: Spacing,
     },
     /// When something outside schedules it; the tag comes from the physical clock.
     Physical {
         /// Added to the physical time of the event.
         min_delay: Duration,
-        /// The least span between two events; an earlier one is deferred.
-        min_spacing: Duration,
+        /// How far events are kept apart.
+        spacing: Spacing,
     },
     /// When the source of a delayed connection was set.
     Connection {
@@ -49,6 +51,38 @@ pub enum ActionKind {
         /// The connection's `after`: added to the physical time of the arrival.
         min_delay: Duration,
     },
+}
+
+/// The least span between two events of an action, and what becomes of one that would come sooner.
+#[derive(Clone, Copy, Default, PartialEq, Eq, Debug)]
+pub struct Spacing {
+    /// From the tag of the action's last event, pending or handled; zero: no spacing, the policy does not matter.
+    pub min: Duration,
+    /// What becomes of an event that would come sooner.
+    pub policy: SpacingPolicy,
+}
+
+/// What becomes of an event that would come too soon after the one before.
+///
+/// Source: Lingua Franca, reactor-c `lf_schedule_trigger`.
+#[derive(Clone, Copy, Default, PartialEq, Eq, Debug)]
+pub enum SpacingPolicy {
+    /// It comes later: at the first tag that keeps the spacing.
+    #[default]
+    Defer,
+    /// It does not come; its value is released.
+    Drop,
+    /// Its value takes the place of the value before, which is released, when that event is still pending; else as
+    /// [`SpacingPolicy::Defer`].
+    Replace,
+}
+
+impl Spacing {
+    /// Events may come as they like.
+    pub const NONE: Self = Self {
+        min: Duration::ZERO,
+        policy: SpacingPolicy::Defer,
+    };
 }
 
 /// What makes a reaction run.

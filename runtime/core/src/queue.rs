@@ -40,11 +40,16 @@ impl Key {
     }
 }
 
+#[inline]
+fn pack(value: ValueId) -> u32 {
+    u32::try_from(value.index()).unwrap_or(u32::MAX)
+}
+
 impl EventQueue {
     #[inline]
     pub(crate) fn push(&mut self, tag: Tag, action: ActionId, value: ValueId) {
-        let value = u32::try_from(value.index()).unwrap_or(u32::MAX);
-        self.heap.push(Reverse((Key::new(tag, action), value)));
+        self.heap
+            .push(Reverse((Key::new(tag, action), pack(value))));
     }
 
     /// The tag of the earliest event.
@@ -68,6 +73,22 @@ impl EventQueue {
     pub(crate) fn contains(&self, tag: Tag, action: ActionId) -> bool {
         let key = Key::new(tag, action);
         self.heap.iter().any(|Reverse((k, _))| *k == key)
+    }
+
+    /// Gives the event of `action` at `tag` another value and returns the former one; `None` when there is no such event.
+    /// O(pending events).
+    pub(crate) fn replace(
+        &mut self,
+        tag: Tag,
+        action: ActionId,
+        value: ValueId,
+    ) -> Option<ValueId> {
+        let key = Key::new(tag, action);
+        let mut events = std::mem::take(&mut self.heap).into_vec();
+        let event = events.iter_mut().find(|Reverse((k, _))| *k == key);
+        let former = event.map(|Reverse((_, held))| std::mem::replace(held, pack(value)));
+        self.heap = events.into();
+        former.map(|former| ValueId::new(former as usize))
     }
 
     pub(crate) fn len(&self) -> usize {

@@ -19,7 +19,7 @@ mod tardiness;
 
 use crate::graph::BitSet;
 use crate::id::{ActionId, InputId, NodeId, OutputId, SlotId, ValueId};
-use crate::program::{ActionKind, NodeKind, Program};
+use crate::program::{ActionKind, NodeKind, Program, Spacing, SpacingPolicy};
 use crate::queue::EventQueue;
 use crate::tag::{Delay, Tag};
 use crate::time::{Duration, LogicalTime, PhysicalTime};
@@ -129,6 +129,8 @@ struct State {
     unknown_count: u32,
     latest: Vec<Tag>,
     tardiness: Tardiness,
+    /// Values whose events were dropped or replaced.
+    released: Vec<(ActionId, ValueId)>,
     network_inputs_ran: bool,
     overflow: bool,
 }
@@ -167,6 +169,7 @@ impl Timeline {
             unknown: BitSet::new(program.inputs.len()),
             latest: vec![Tag::NEVER; program.actions.len()],
             tardiness: Tardiness::new(nodes),
+            released: Vec::new(),
             queue: EventQueue::default(),
             start: Tag::NEVER,
             stop: Tag::FOREVER,
@@ -386,6 +389,8 @@ impl Timeline {
     /// Queues an event from outside and returns its tag: the stamp plus the action's minimum delay, but after the
     /// current tag, not before `floor` (what was promised to others), and spaced from the action's last event.
     ///
+    /// When the policy of the spacing drops the event, or gives its value to the last one, the tag is that of the last one.
+    ///
     /// # Panics
     ///
     /// When `action` is neither a physical action nor that of a physical connection.
@@ -396,12 +401,9 @@ impl Timeline {
         value: ValueId,
         floor: Tag,
     ) -> Tag {
-        let (min_delay, min_spacing) = match self.program.actions[action.index()] {
-            ActionKind::Physical {
-                min_delay,
-                min_spacing,
-            } => (min_delay, min_spacing),
-            ActionKind::PhysicalConnection { min_delay } => (min_delay, Duration::ZERO),
+        let (min_delay, spacing) = match self.program.actions[action.index()] {
+            ActionKind::Physical { min_delay, spacing } => (min_delay, spacing),
+            ActionKind::PhysicalConnection { min_delay } => (min_delay, Spacing::NONE),
             ActionKind::Startup
             | ActionKind::Shutdown
             | ActionKind::Timer { .. }
@@ -414,17 +416,23 @@ impl Timeline {
         let wanted = Tag::new(stamp.saturating_add(min_delay).as_logical(), 0);
         let after_current = self.state.at.successor();
         let last = self.state.latest[action.index()];
-        let spaced = match min_spacing {
-            Duration::ZERO => last.next_microstep().unwrap_or(Tag::NEVER),
-            _ if last == Tag::NEVER => Tag::NEVER,
-            _ => last.delayed(Delay::Time(min_spacing)),
-        };
+        let after_last = last.next_microstep().unwrap_or(Tag::NEVER);
         let tag = wanted
             .max(after_current)
             .max(floor)
-            .max(spaced)
             .max(self.state.start);
-        self.state.enqueue(tag, action, value)
+        if spacing.min > Duration::ZERO {
+            self.state.enqueue_spaced(tag, spacing, action, value)
+        } else {
+            self.state.enqueue(tag.max(after_last), action, value)
+        }
+    }
+
+    /// A value that no event will carry, because the policy of a spacing dropped or replaced it, with its action. The caller
+    /// hands them to [`Executor::release`](crate::Executor::release), before it schedules many.
+    #[inline]
+    pub fn pop_released(&mut self) -> Option<(ActionId, ValueId)> {
+        self.state.released.pop()
     }
 
     /// The tag at which a message for `input` with `tag` is due: its own, or a microstep after the last one's when they
@@ -622,8 +630,14 @@ impl State {
     #[inline]
     fn schedule(&mut self, program: &Program, event: Scheduled) {
         let delay = match program.actions[event.action.index()] {
-            ActionKind::Logical { min_delay } => {
-                Delay::after(min_delay.saturating_add(event.delay.max(Duration::ZERO)))
+            ActionKind::Logical { min_delay, spacing } => {
+                let delay = min_delay.saturating_add(event.delay.max(Duration::ZERO));
+                if spacing.min > Duration::ZERO {
+                    let tag = self.at.delayed(Delay::after(delay));
+                    self.enqueue_spaced(tag, spacing, event.action, event.value);
+                    return;
+                }
+                Delay::after(delay)
             }
             ActionKind::Connection { delay } => delay,
             ActionKind::Startup
@@ -637,6 +651,33 @@ impl State {
             }
         };
         self.enqueue(self.at.delayed(delay), event.action, event.value);
+    }
+
+    /// Queues an event that may be too soon after the action's last one, and returns the tag of the event that stands for it.
+    fn enqueue_spaced(
+        &mut self,
+        tag: Tag,
+        spacing: Spacing,
+        action: ActionId,
+        value: ValueId,
+    ) -> Tag {
+        let last = self.latest[action.index()];
+        let earliest = last.delayed(Delay::Time(spacing.min));
+        if last == Tag::NEVER || tag >= earliest {
+            return self.enqueue(tag, action, value);
+        }
+        let released = match spacing.policy {
+            SpacingPolicy::Defer => None,
+            SpacingPolicy::Drop => Some(value),
+            SpacingPolicy::Replace => self.queue.replace(last, action, value),
+        };
+        match released {
+            Some(released) => {
+                self.released.push((action, released));
+                last
+            }
+            None => self.enqueue(earliest, action, value),
+        }
     }
 
     /// Queues an event; a second one of the same action at the same tag goes one microstep later.

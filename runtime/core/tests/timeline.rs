@@ -5,7 +5,7 @@
 use ictus_core::{
     ActionId, ActionKind, Admission, Delay, Duration, DurationExt, Effects, NodeId, PhysicalTime,
     PortId, PortKind, Program, ProgramBuilder, ProgramError, Progress, ReactionSpec, ReactorId,
-    Scheduled, SlotId, Tag, Timeline, Trigger, ValueId,
+    Scheduled, SlotId, Spacing, SpacingPolicy, Tag, Timeline, Trigger, ValueId,
 };
 use proptest::prelude::*;
 use std::sync::Arc;
@@ -124,7 +124,10 @@ fn after_zero_is_one_microstep_and_no_delay_is_none() {
 fn the_nth_event_for_one_tag_goes_n_microsteps_later() {
     let mut builder = ProgramBuilder::new();
     let a = builder.reactor("a");
-    let action = builder.action(ActionKind::Logical { min_delay: 5.ns() });
+    let action = builder.action(ActionKind::Logical {
+        min_delay: 5.ns(),
+        spacing: Spacing::NONE,
+    });
     builder.reaction(spec(a, &[Trigger::Action(ActionId::STARTUP)], &[]));
     builder.reaction(spec(a, &[Trigger::Action(action)], &[]));
     let event = Scheduled {
@@ -323,7 +326,10 @@ proptest! {
         let a = builder.reactor("a");
         let action = builder.action(ActionKind::Physical {
             min_delay: 3.ns(),
-            min_spacing: Duration::from_nanos(spacing),
+            spacing: Spacing {
+                min: Duration::from_nanos(spacing),
+                policy: SpacingPolicy::Defer,
+            },
         });
         builder.reaction(spec(a, &[Trigger::Action(action)], &[]));
         let mut timeline = Timeline::new(Arc::new(builder.build().unwrap()));
@@ -537,5 +543,80 @@ proptest! {
             prop_assert_eq!(ran, expected);
         }
         prop_assert_eq!(timeline.next_tag(), Tag::at(60));
+    }
+}
+
+fn spaced(policy: SpacingPolicy) -> (Timeline, ActionId) {
+    let mut builder = ProgramBuilder::new();
+    let a = builder.reactor("a");
+    let action = builder.action(ActionKind::Physical {
+        min_delay: Duration::ZERO,
+        spacing: Spacing {
+            min: 10.ns(),
+            policy,
+        },
+    });
+    builder.reaction(spec(a, &[Trigger::Action(action)], &[]));
+    let mut timeline = Timeline::new(Arc::new(builder.build().unwrap()));
+    timeline.start(Tag::at(0), Tag::FOREVER);
+    (timeline, action)
+}
+
+proptest! {
+    /// Whatever the policy: events are handled at least the spacing apart, every value is handled once or released once, and
+    /// - defer releases none;
+    /// - drop handles each event at its own tag;
+    /// - replace never delays an event for longer than defer does, and handles the newest value last.
+    #[test]
+    fn spacing_keeps_events_apart_and_loses_no_value(
+        steps in prop::collection::vec((0i64..8, any::<bool>()), 1..30),
+        policy in prop::sample::select(vec![SpacingPolicy::Defer, SpacingPolicy::Drop, SpacingPolicy::Replace]),
+    ) {
+        let (mut timeline, action) = spaced(policy);
+        let (mut handled, mut released) = (Vec::new(), Vec::new());
+        let mut now = 0;
+        let mut wanted = Vec::new();
+        let mut run = |timeline: &mut Timeline| {
+            let tag = timeline.next_tag();
+            let mut present = Vec::new();
+            timeline.begin(tag, &mut present);
+            let mine = present.iter().filter(|(fired, _)| *fired == action);
+            handled.extend(mine.map(|(_, value)| (tag, value.index())));
+            let program = Arc::clone(timeline.program());
+            drive(timeline, &program);
+            timeline.complete();
+        };
+        for (value, (gap, handle)) in steps.into_iter().enumerate() {
+            now += gap;
+            wanted.push(now);
+            let stamp = PhysicalTime::from_nanos(now);
+            timeline.schedule_physical(stamp, action, ValueId::new(value), Tag::NEVER);
+            while let Some((of, value)) = timeline.pop_released() {
+                prop_assert_eq!(of, action);
+                released.push(value.index());
+            }
+            if handle && timeline.next_tag() <= Tag::at(now) {
+                run(&mut timeline);
+            }
+        }
+        while timeline.next_tag() != Tag::FOREVER {
+            run(&mut timeline);
+        }
+        for pair in handled.windows(2) {
+            prop_assert!(pair[1].0.time.since(pair[0].0.time) >= 10.ns());
+        }
+        let mut values: Vec<_> = handled.iter().map(|(_, value)| *value).chain(released.clone()).collect();
+        values.sort_unstable();
+        prop_assert_eq!(values, (0..wanted.len()).collect::<Vec<_>>());
+        match policy {
+            SpacingPolicy::Defer => prop_assert!(released.is_empty()),
+            SpacingPolicy::Drop => for (tag, value) in &handled {
+                prop_assert!(tag.time.as_nanos() <= wanted[*value].max(0) + 1);
+            },
+            SpacingPolicy::Replace => {
+                prop_assert_eq!(handled.last().unwrap().1, wanted.len() - 1);
+                prop_assert!(handled.last().unwrap().0.time.as_nanos() <= now + 10);
+            }
+        }
     }
 }

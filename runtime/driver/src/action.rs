@@ -174,9 +174,11 @@ impl<T: Value> Writable for LogicalAction<T> {}
 #[derive(Clone, Debug)]
 pub struct PhysicalAction<T> {
     action: ActionId,
+    name: &'static str,
     values: Shared<ActionValues<T>>,
     outside: Arc<Outside>,
     held: Option<Held<T>>,
+    scheduled: Vec<T>,
 }
 
 impl<T> PhysicalAction<T> {
@@ -193,19 +195,28 @@ impl<T> PhysicalAction<T> {
     pub const fn is_present(&self) -> bool {
         self.held.is_some()
     }
+
+    /// Schedules the action at the physical time at which the reaction, or the handler of a watchdog, ends, plus its minimum
+    /// delay. Once the program has ended, nothing happens.
+    pub fn schedule(&mut self, value: T) {
+        self.scheduled.push(value);
+    }
 }
 
 impl<T: Value> PhysicalAction<T> {
     pub(crate) const fn new(
         action: ActionId,
+        name: &'static str,
         values: Shared<ActionValues<T>>,
         outside: Arc<Outside>,
     ) -> Self {
         Self {
             action,
+            name,
             values,
             outside,
             held: None,
+            scheduled: Vec::new(),
         }
     }
 
@@ -237,8 +248,13 @@ impl<T: Value> Item for PhysicalAction<T> {
     }
 
     #[inline]
-    fn release(&mut self, _: Role, _: &mut Outcome<'_>) {
+    fn release(&mut self, _: Role, outcome: &mut Outcome<'_>) {
         self.held = None;
+        for value in self.scheduled.drain(..) {
+            outcome.note(self.name, || digest_of(&value));
+            // The program has ended: nobody will miss the value.
+            drop(self.outside.push(self.action, value));
+        }
     }
 }
 

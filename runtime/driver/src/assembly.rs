@@ -120,11 +120,11 @@ pub enum AssemblyError {
         serializer: String,
     },
     /// A plan that runs ahead of physical time has something that is scheduled by it.
-    #[error("`fast`, but {what} `{path}` is scheduled by the physical clock")]
+    #[error("`fast`, but {what} `{path}` goes by the physical clock")]
     Fast {
-        /// `the physical action`, or `the physical connection to`.
+        /// `the physical action`, `the watchdog`, or `the physical connection to`.
         what: &'static str,
-        /// The action, or the receiving port.
+        /// The action, the watchdog, or the receiving port.
         path: String,
     },
     /// A mistake in a `#[connections]` function.
@@ -325,12 +325,12 @@ impl<'a> Assembler<'a> {
                 path: self.end_path(&found.to),
             });
         }
-        let action = self.elaboration.physical.first();
-        action.map_or(Ok(()), |(_, path)| {
-            Err(AssemblyError::Fast {
-                what: "the physical action",
-                path: path.clone(),
-            })
+        let action = self.elaboration.physical.first().map(|(_, path)| path);
+        let action = action.map(|path| ("the physical action", path.clone()));
+        let watchdog = || Some(("the watchdog", self.elaboration.watchdogs.first()?.to_owned()));
+        let found = action.or_else(watchdog);
+        found.map_or(Ok(()), |(what, path)| {
+            Err(AssemblyError::Fast { what, path })
         })
     }
 
@@ -385,10 +385,12 @@ impl<'a> Assembler<'a> {
             mut bodies,
             mut carriers,
             physical,
+            mut watchdogs,
             errors,
             ..
         } = self.elaboration;
-        if let Some(error) = errors.into_iter().next() {
+        let errors = errors.into_iter().chain(watchdogs.unhandled());
+        if let Some(error) = { errors }.next() {
             return Err(error.into());
         }
         let program = Arc::new(program.build()?);
@@ -404,12 +406,17 @@ impl<'a> Assembler<'a> {
             linker.reactor = Some(entry.reactor);
             entry.body.link(&mut linker);
         }
+        for handler in watchdogs.handlers_mut() {
+            linker.reactor = Some(handler.reactor);
+            handler.body.link(&mut linker);
+        }
         debug_assert_eq!(linker.mismatch, None, "connections were checked");
         let ctx = Ctx {
             tag: Tag::NEVER,
             start: Tag::ZERO,
             reactor: ReactorId::new(0),
             stop: false,
+            intended: None,
             clock: self.clock,
             program: Arc::clone(&program),
         };
@@ -422,6 +429,7 @@ impl<'a> Assembler<'a> {
             senders,
             input_types: self.input_types,
             physical,
+            watchdogs,
             outside: self.outside,
             observer: None,
             counters: Counters::default(),

@@ -7,8 +7,9 @@ use crate::ctx::Ctx;
 pub(crate) use crate::observe::Observation;
 use crate::observe::{Observer, Run};
 use crate::outside::{Outside, OutsideEvent};
-use crate::scope::BodyEntry;
+use crate::scope::{BodyEntry, Case};
 use crate::slot::Epoch;
+use crate::watchdog::{Fired, Watchdogs};
 use ictus_coord::{FederateExecutor, PayloadError};
 use ictus_core::{
     ActionId, Duration, Effects, Executor, InputId, NodeId, NodeKind, OutputId, PhysicalTime,
@@ -34,18 +35,19 @@ pub struct Bodies {
     pub(crate) input_types: Vec<String>,
     /// Paths of the physical actions and of the ports that physical connections feed.
     pub(crate) physical: Vec<(ActionId, String)>,
+    pub(crate) watchdogs: Watchdogs,
     pub(crate) outside: Arc<Outside>,
     pub(crate) observer: Option<Observer>,
     pub(crate) counters: Counters,
     pub(crate) fault: Option<Fault>,
 }
 
-/// A panic in a reaction, or a value that no serializer could write. Fatal: no further body runs.
+/// A panic in a reaction or a watchdog's handler, or a value that no serializer could write. Fatal: no further body runs.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Fault {
     /// The reactor's path.
     pub path: String,
-    /// The reaction's name, or the output's.
+    /// The reaction's or the handler's name, or the output's.
     pub reaction: String,
     /// The tag at which it happened.
     pub tag: Tag,
@@ -56,10 +58,14 @@ pub struct Fault {
 /// What the bodies did so far.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Counters {
-    /// Reactions run, deadline handlers included.
+    /// Reactions run, their handlers included.
     pub reactions: u64,
     /// Deadline handlers run instead of a body.
     pub deadlines_missed: u64,
+    /// STP handlers run instead of a body.
+    pub stp_handled: u64,
+    /// Watchdogs that expired.
+    pub watchdogs_fired: u64,
 }
 
 impl Bodies {
@@ -115,6 +121,63 @@ impl Bodies {
         }
     }
 
+    /// Notes in the trace that a message for `input` is handled at `actual` instead of at `intended`.
+    pub fn note_tardy(&mut self, input: InputId, intended: Tag, actual: Tag) {
+        if let Some(observer) = &mut self.observer {
+            let port = self.program.network_inputs()[input.index()].port;
+            let path = self.program.port_path(port);
+            observer.tardy(self.ctx.start, (intended, actual), &path);
+        }
+    }
+
+    /// When the next watchdog expires: then [`Bodies::fire_watchdogs`] is due, whatever tag is executed or waited for.
+    #[inline]
+    #[must_use]
+    pub fn next_watchdog(&self) -> Option<PhysicalTime> {
+        self.watchdogs.next()
+    }
+
+    /// Runs the handlers of the watchdogs that have expired; between reactions, not after the stop tag. A panic is a fault.
+    pub fn fire_watchdogs(&mut self, now: PhysicalTime) -> Fired {
+        let mut fired = Fired::default();
+        for index in self.watchdogs.take_expired(now) {
+            if self.fault.is_some() {
+                break;
+            }
+            self.fire(index, now);
+            fired.count += 1;
+        }
+        self.counters.watchdogs_fired += fired.count;
+        fired.stop = std::mem::take(&mut self.ctx.stop);
+        fired
+    }
+
+    fn fire(&mut self, index: usize, now: PhysicalTime) {
+        let Some((path, handler)) = self.watchdogs.entry(index) else {
+            return;
+        };
+        if let Some(observer) = &mut self.observer {
+            observer.watchdog(self.ctx.start, now, path);
+        }
+        // Its items are physical actions: they go to the queue of outside events.
+        let mut effects = Effects::default();
+        let mut outcome = Outcome {
+            effects: &mut effects,
+            trace: None,
+        };
+        let (ctx, epoch) = (&mut self.ctx, self.epoch);
+        ctx.reactor = handler.reactor;
+        let run = AssertUnwindSafe(|| handler.body.run(ctx, epoch, Case::Body, &mut outcome));
+        if let Err(panic) = catch_unwind(run) {
+            self.fault = Some(Fault {
+                path: self.program.reactor_path(handler.reactor).to_owned(),
+                reaction: handler.name.to_owned(),
+                tag: self.ctx.tag,
+                message: words(&*panic),
+            });
+        }
+    }
+
     /// Notes in the trace a stop by request.
     pub fn note_stop(&mut self, tag: Tag) {
         if let Some(observer) = &mut self.observer {
@@ -147,24 +210,31 @@ impl Bodies {
             return;
         }
         let entry = &mut self.bodies[node.index()];
-        self.ctx.reactor = entry.reactor;
-        let late = match entry.deadline {
+        let late = match entry.handlers.deadline {
             // As in LF, a deadline of zero is always missed.
             Some(deadline) => deadline == Duration::ZERO || self.ctx.lag() > deadline,
             None => false,
         };
-        self.counters.reactions += 1;
         self.counters.deadlines_missed += u64::from(late);
+        let case = if late { Case::Deadline } else { Case::Body };
+        self.react_as(node, case, effects);
+    }
+
+    #[inline]
+    fn react_as(&mut self, node: NodeId, case: Case, effects: &mut Effects) {
+        self.counters.reactions += 1;
         if self.observer.is_some() {
-            self.react_observed(node, late, effects);
+            self.react_observed(node, case, effects);
             return;
         }
+        let entry = &mut self.bodies[node.index()];
+        self.ctx.reactor = entry.reactor;
         let mut outcome = Outcome {
             effects,
             trace: None,
         };
         let (ctx, epoch) = (&mut self.ctx, self.epoch);
-        let run = AssertUnwindSafe(|| entry.body.run(ctx, epoch, late, &mut outcome));
+        let run = AssertUnwindSafe(|| entry.body.run(ctx, epoch, case, &mut outcome));
         if let Err(panic) = catch_unwind(run) {
             self.fail(node, &*panic);
         }
@@ -172,8 +242,9 @@ impl Bodies {
     }
 
     #[cold]
-    fn react_observed(&mut self, node: NodeId, late: bool, effects: &mut Effects) {
+    fn react_observed(&mut self, node: NodeId, case: Case, effects: &mut Effects) {
         let entry = &mut self.bodies[node.index()];
+        self.ctx.reactor = entry.reactor;
         let start = self.ctx.clock.now();
         let mut trace = String::new();
         let mut outcome = Outcome {
@@ -181,11 +252,11 @@ impl Bodies {
             trace: Some(&mut trace),
         };
         let (ctx, epoch) = (&mut self.ctx, self.epoch);
-        let run = AssertUnwindSafe(|| entry.body.run(ctx, epoch, late, &mut outcome));
+        let run = AssertUnwindSafe(|| entry.body.run(ctx, epoch, case, &mut outcome));
         let result = catch_unwind(run);
         let end = self.ctx.clock.now();
         match result {
-            Ok(()) => self.record(node, late, &trace, (start, end)),
+            Ok(()) => self.record(node, case, &trace, (start, end)),
             Err(panic) => self.fail(node, &*panic),
         }
         effects.stop |= std::mem::take(&mut self.ctx.stop);
@@ -194,7 +265,7 @@ impl Bodies {
     fn record(
         &mut self,
         node: NodeId,
-        late: bool,
+        case: Case,
         effects: &str,
         (start, end): (PhysicalTime, PhysicalTime),
     ) {
@@ -206,7 +277,7 @@ impl Bodies {
                 reactor: reaction.spec.reactor,
                 path: self.program.reactor_path(reaction.spec.reactor),
                 index: reaction.index,
-                late,
+                case,
                 effects,
                 start,
                 end,
@@ -231,6 +302,9 @@ impl Executor for Bodies {
     fn begin(&mut self, tag: Tag) {
         self.ctx.tag = tag;
         self.epoch.advance();
+        if !self.watchdogs.is_empty() {
+            self.watchdogs.begin(tag.time);
+        }
     }
 
     #[inline]
@@ -249,6 +323,24 @@ impl Executor for Bodies {
             // The value stays in its slot; the federate asks for its bytes with `encode`.
             NodeKind::Send { .. } => {}
         }
+    }
+
+    #[cold]
+    fn run_tardy(&mut self, node: NodeId, tag: Tag, intended: Tag, effects: &mut Effects) {
+        let stp = |entry: &BodyEntry| entry.handlers.stp;
+        self.ctx.intended = Some(intended);
+        // Reactions come first among the nodes.
+        if self.bodies.get(node.index()).is_some_and(stp) && self.fault.is_none() {
+            self.counters.stp_handled += 1;
+            self.react_as(node, Case::Stp, effects);
+        } else {
+            self.run(node, tag, effects);
+        }
+        self.ctx.intended = None;
+    }
+
+    fn release(&mut self, action: ActionId, value: ValueId) {
+        self.carriers[action.index()].release(value);
     }
 }
 
@@ -274,6 +366,14 @@ impl FederateExecutor for Bodies {
             length: payload.len(),
             reason: error.to_string(),
         })
+    }
+
+    fn stamped(&mut self, action: ActionId, tag: Tag) {
+        self.note_physical(action, tag);
+    }
+
+    fn tardy(&mut self, input: InputId, intended: Tag, actual: Tag) {
+        self.note_tardy(input, intended, actual);
     }
 }
 

@@ -26,6 +26,9 @@ pub(crate) trait Carrier {
         Ok(ValueId::NONE)
     }
 
+    /// No event will carry this value.
+    fn release(&mut self, _: ValueId) {}
+
     /// Of a physical action: takes a value sent from outside.
     fn accept(&mut self, _: Box<dyn Any + Send>) -> ValueId {
         ValueId::NONE
@@ -48,6 +51,10 @@ impl<T: Value> Carrier for Shared<ActionValues<T>> {
         if let Some(value) = values.waiting.take(value) {
             values.slot.set(value, epoch);
         }
+    }
+
+    fn release(&mut self, value: ValueId) {
+        drop(self.write().waiting.take(value));
     }
 
     fn accept(&mut self, value: Box<dyn Any + Send>) -> ValueId {

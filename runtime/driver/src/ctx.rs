@@ -13,6 +13,8 @@ pub struct Ctx {
     pub(crate) start: Tag,
     pub(crate) reactor: ReactorId,
     pub(crate) stop: bool,
+    /// The tag at which the running reaction should have run, when a tardy message led to it.
+    pub(crate) intended: Option<Tag>,
     pub(crate) clock: Arc<dyn Clock>,
     pub(crate) program: Arc<Program>,
 }
@@ -23,6 +25,15 @@ impl Ctx {
     #[must_use]
     pub const fn tag(&self) -> Tag {
         self.tag
+    }
+
+    /// The tag at which this reaction should have run: the least tag over the tardy messages that led to it; the present tag
+    /// when none was tardy.
+    ///
+    /// Only under decentralized coordination can a message be tardy: it came after the tag had been handled without it.
+    #[must_use]
+    pub fn intended(&self) -> Tag {
+        self.intended.unwrap_or(self.tag)
     }
 
     /// Logical time since the start tag.

@@ -259,6 +259,7 @@ mod slot;
 mod status;
 mod transport;
 pub mod value;
+mod watchdog;
 mod wiring;
 
 pub use action::{LogicalAction, PhysicalAction, PhysicalSender, Shutdown, Startup, Timer};
@@ -275,6 +276,7 @@ pub use port::{Input, Multi, Output};
 pub use reactor::{Bank, Child};
 pub use run::{RunError, main_with};
 pub use value::Value;
+pub use watchdog::{Fired, Watchdog};
 pub use wiring::{End, Link, Wiring};
 
 /// The `main` of a program whose manifests may name these classes: `ictus::program![Camera, Planner];`.
@@ -296,18 +298,19 @@ pub mod build {
     pub use crate::linker::Linker;
     pub use crate::parameters::{Complete, Missing, ParameterError, ParameterSource, parameter};
     pub use crate::reactor::{Reactions, Reactor};
-    pub use crate::scope::{ReactionScope, Scope, WiringError};
+    pub use crate::scope::{Case, Handlers, ReactionScope, Scope, WiringError};
     pub use crate::slot::Epoch;
     #[doc(hidden)]
     pub use crate::value::{put_front, take_front};
     pub use ictus_coord::describe::ParameterDescription;
+    pub use ictus_core::{Spacing, SpacingPolicy};
 }
 
 /// Everything that a file with reactors needs.
 pub mod prelude {
     pub use crate::{
         Bank, Child, Ctx, Duration, DurationExt, Input, LogicalAction, LogicalTime, Multi, Output,
-        PhysicalAction, PhysicalSender, PhysicalTime, Shutdown, Startup, Tag, Timer, Value, Wiring,
-        log, reactions, reactor,
+        PhysicalAction, PhysicalSender, PhysicalTime, Shutdown, Startup, Tag, Timer, Value,
+        Watchdog, Wiring, log, reactions, reactor,
     };
 }

@@ -1,6 +1,8 @@
 //! Trace and timing files: what was executed, line by line. The formats stand in ARCHITECTURE.md.
 
+use crate::scope::Case;
 use ictus_core::{PhysicalTime, Program, ReactorId, Tag};
+use std::fmt;
 use std::fs::File;
 use std::io::{self, BufWriter, Write};
 use std::path::{Path, PathBuf};
@@ -36,7 +38,7 @@ pub(crate) struct Run<'a> {
     pub(crate) reactor: ReactorId,
     pub(crate) path: &'a str,
     pub(crate) index: u32,
-    pub(crate) late: bool,
+    pub(crate) case: Case,
     pub(crate) effects: &'a str,
     pub(crate) start: PhysicalTime,
     pub(crate) end: PhysicalTime,
@@ -96,17 +98,39 @@ impl Observer {
     }
 
     pub(crate) fn physical(&mut self, origin: Tag, tag: Tag, path: &str) {
-        let (time, microstep) = (tag.time.since(origin.time).as_nanos(), tag.microstep);
+        let (time, microstep) = after(origin, tag);
+        self.note(path, format_args!("# physical {time} {microstep} {path}"));
+    }
+
+    /// A message for the input `path` that came after the input had been decided.
+    pub(crate) fn tardy(&mut self, origin: Tag, (intended, actual): (Tag, Tag), path: &str) {
+        let (time, microstep) = after(origin, actual);
+        let (intended_time, intended_microstep) = after(origin, intended);
+        self.note(
+            path,
+            format_args!(
+                "# tardy {time} {microstep} {path} {intended_time} {intended_microstep}"
+            ),
+        );
+    }
+
+    /// A watchdog that expired at a physical time.
+    pub(crate) fn watchdog(&mut self, origin: Tag, now: PhysicalTime, path: &str) {
+        let time = now.since(origin.time.as_physical()).as_nanos();
+        self.note(path, format_args!("# watchdog {time} {path}"));
+    }
+
+    fn note(&mut self, path: &str, line: fmt::Arguments<'_>) {
         let name = federate_name(path);
         let federate = self.federates.iter_mut().find(|f| f.name == name);
         if let Some(trace) = federate.and_then(|f| f.trace.as_mut()) {
-            let result = writeln!(trace, "# physical {time} {microstep} {path}");
+            let result = writeln!(trace, "{line}");
             self.keep(result);
         }
     }
 
     pub(crate) fn stop(&mut self, origin: Tag, tag: Tag) {
-        let (time, microstep) = (tag.time.since(origin.time).as_nanos(), tag.microstep);
+        let (time, microstep) = after(origin, tag);
         let result = self
             .traces()
             .try_for_each(|trace| writeln!(trace, "# stop {time} {microstep}"));
@@ -122,7 +146,7 @@ impl Observer {
     }
 
     pub(crate) fn end(mut self, origin: Tag, tag: Tag, reason: &str) -> io::Result<()> {
-        let (time, microstep) = (tag.time.since(origin.time).as_nanos(), tag.microstep);
+        let (time, microstep) = after(origin, tag);
         let reason = reason.replace(['\n', '\r'], " ");
         let result = self.traces().try_for_each(|trace| {
             writeln!(trace, "# end {time} {microstep} {reason}")?;
@@ -151,7 +175,11 @@ impl Files {
         let time = run.tag.time.since(run.origin.time).as_nanos();
         let (microstep, path, index) = (run.tag.microstep, run.path, run.index);
         if let Some(trace) = &mut self.trace {
-            let kind = if run.late { "deadline" } else { "body" };
+            let kind = match run.case {
+                Case::Body => "body",
+                Case::Deadline => "deadline",
+                Case::Stp => "stp",
+            };
             let effects = if run.effects.is_empty() {
                 "-"
             } else {
@@ -173,6 +201,11 @@ impl Files {
         }
         Ok(())
     }
+}
+
+/// A tag as the trace shows it: nanoseconds after the start tag, and the microstep.
+fn after(origin: Tag, tag: Tag) -> (i64, u32) {
+    (tag.time.since(origin.time).as_nanos(), tag.microstep)
 }
 
 /// The first element of a path: a federate is a top-level instance.

@@ -16,7 +16,7 @@ use std::ops::Deref;
 ///
 /// ```
 /// use ictus::build::{
-///     ParameterDescription, ParameterError, ParameterSource, ReactionScope, Reactions, Reactor, Scope,
+///     Handlers, ParameterDescription, ParameterError, ParameterSource, ReactionScope, Reactions, Reactor, Scope,
 ///     effect, trigger,
 /// };
 /// use ictus::{Duration, DurationExt, Output, Timer};
@@ -56,7 +56,7 @@ use std::ops::Deref;
 /// impl Reactions for Counter {
 ///     fn react(&self, parts: &Parts, scope: &mut ReactionScope<'_, Self>) {
 ///         let items = (trigger(&parts.tick), (effect(&parts.out), ()));
-///         scope.reaction("count", None, items, |state, _, (_, (out, ())), _| {
+///         scope.reaction("count", Handlers::default(), items, |state, _, (_, (out, ())), _| {
 ///             state.count += 1;
 ///             out.item_mut().set(state.count);
 ///         });

@@ -11,10 +11,11 @@ use crate::port::{Input, Multi, Output};
 use crate::reactor::{Bank, Child, Reactions};
 use crate::slot::{Epoch, Shared, Signal};
 use crate::value::Value;
+use crate::watchdog::{Watchdog, WatchdogHandler, Watchdogs};
 use crate::wiring::Wiring;
 use ictus_core::{
     ActionId, ActionKind, Delay, Duration, PortId, PortKind, ProgramBuilder, ReactionSpec,
-    ReactorId,
+    ReactorId, Spacing,
 };
 use std::fmt;
 use std::rc::Rc;
@@ -29,6 +30,7 @@ pub(crate) struct Elaboration {
     pub(crate) carriers: Vec<Box<dyn Carrier>>,
     /// Paths of physical actions and of ports that physical connections feed, for the trace.
     pub(crate) physical: Vec<(ActionId, String)>,
+    pub(crate) watchdogs: Watchdogs,
     pub(crate) errors: Vec<WiringError>,
     startup: Signal,
     shutdown: Signal,
@@ -45,7 +47,7 @@ pub(crate) struct DeclaredPort {
     pub(crate) typed: Rc<dyn PortType>,
 }
 
-/// A mistake in a `#[connections]` function.
+/// A mistake in the parts of a reactor or in a `#[connections]` function.
 #[derive(Clone, PartialEq, Eq, Debug, Error)]
 #[non_exhaustive]
 pub enum WiringError {
@@ -58,6 +60,14 @@ pub enum WiringError {
         what: &'static str,
         /// The span.
         span: Duration,
+    },
+    /// A watchdog has no handler, or two.
+    #[error("{path}: the watchdog has {count} handlers instead of one: write one method `#[watchdog({name})]`", name = path.rsplit('.').next().unwrap_or_default())]
+    Watchdog {
+        /// The watchdog's path.
+        path: String,
+        /// How many handlers it has.
+        count: usize,
     },
     /// A connection that runs against the grain.
     #[error(
@@ -93,6 +103,7 @@ impl Elaboration {
             bodies: Vec::new(),
             carriers: vec![Box::new(startup.clone()), Box::new(shutdown.clone())],
             physical: Vec::new(),
+            watchdogs: Watchdogs::default(),
             errors: Vec::new(),
             startup,
             shutdown,
@@ -251,10 +262,12 @@ impl Scope<'_> {
         &mut self,
         name: &'static str,
         min_delay: Duration,
+        spacing: Spacing,
     ) -> LogicalAction<T> {
         self.not_negative("minimum delay of an action", min_delay);
+        self.not_negative("minimum spacing of an action", spacing.min);
         let values = Shared::new(ActionValues::new());
-        let kind = ActionKind::Logical { min_delay };
+        let kind = ActionKind::Logical { min_delay, spacing };
         let action = self.elaboration.action(kind, Box::new(values.clone()));
         LogicalAction::new(action, name, values)
     }
@@ -264,19 +277,23 @@ impl Scope<'_> {
         &mut self,
         name: &'static str,
         min_delay: Duration,
-        min_spacing: Duration,
+        spacing: Spacing,
     ) -> PhysicalAction<T> {
         self.not_negative("minimum delay of an action", min_delay);
-        self.not_negative("minimum spacing of an action", min_spacing);
+        self.not_negative("minimum spacing of an action", spacing.min);
         let values = Shared::new(ActionValues::new());
-        let kind = ActionKind::Physical {
-            min_delay,
-            min_spacing,
-        };
+        let kind = ActionKind::Physical { min_delay, spacing };
         let action = self.elaboration.action(kind, Box::new(values.clone()));
         let path = format!("{}.{name}", self.path);
         self.elaboration.physical.push((action, path));
-        PhysicalAction::new(action, values, Arc::clone(&self.elaboration.outside))
+        PhysicalAction::new(action, name, values, Arc::clone(&self.elaboration.outside))
+    }
+
+    /// Adds a watchdog that expires `timeout` after the tag at which it was started.
+    pub fn watchdog(&mut self, name: &'static str, timeout: Duration) -> Watchdog {
+        self.not_negative("timeout of a watchdog", timeout);
+        let path = format!("{}.{name}", self.path);
+        self.elaboration.watchdogs.add(path, timeout)
     }
 
     /// Adds a nested reactor.
@@ -343,14 +360,15 @@ impl<R: 'static> ReactionScope<'_, R> {
         Shutdown::new(ActionId::SHUTDOWN, self.scope.elaboration.shutdown.clone())
     }
 
-    /// Adds a reaction. `body` gets `true` when the deadline was missed and the handler is to run instead.
+    /// Adds a reaction. `body` gets which of its functions is to run: never a handler that it does not have.
     pub fn reaction<A: Args>(
         &mut self,
         name: &str,
-        deadline: Option<Duration>,
+        handlers: Handlers,
         args: A,
-        body: impl FnMut(&mut R, &mut Ctx, &mut A, bool) + 'static,
+        body: impl FnMut(&mut R, &mut Ctx, &mut A, Case) + 'static,
     ) {
+        let deadline = handlers.deadline;
         if let Some(deadline) = deadline {
             self.scope.not_negative("deadline of a reaction", deadline);
         }
@@ -367,13 +385,33 @@ impl<R: 'static> ReactionScope<'_, R> {
         });
         elaboration.bodies.push(BodyEntry {
             reactor: self.scope.reactor,
-            deadline,
+            handlers,
             body: Box::new(TypedBody {
                 state: self.state.clone(),
                 args,
                 body,
             }),
         });
+    }
+
+    /// Says what runs when `watchdog` expires: once a watchdog, with physical actions only.
+    pub fn watchdog<A: Args>(
+        &mut self,
+        watchdog: &Watchdog,
+        name: &'static str,
+        args: A,
+        mut body: impl FnMut(&mut R, &mut Ctx, &mut A) + 'static,
+    ) {
+        let handler = WatchdogHandler {
+            name,
+            reactor: self.scope.reactor,
+            body: Box::new(TypedBody {
+                state: self.state.clone(),
+                args,
+                body: move |state: &mut R, ctx: &mut Ctx, args: &mut A, _| body(state, ctx, args),
+            }),
+        };
+        self.scope.elaboration.watchdogs.handle(watchdog, handler);
     }
 
     /// Connects ports of children and of the reactor itself.
@@ -387,15 +425,35 @@ impl<R: 'static> ReactionScope<'_, R> {
 /// A reaction's body with what its run needs to know.
 pub(crate) struct BodyEntry {
     pub(crate) reactor: ReactorId,
-    pub(crate) deadline: Option<Duration>,
+    pub(crate) handlers: Handlers,
     pub(crate) body: Box<dyn Body>,
+}
+
+/// What may run instead of a reaction's body.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Handlers {
+    /// How long after its tag's time the reaction may start, physically, before its deadline handler runs instead.
+    pub deadline: Option<Duration>,
+    /// Whether an STP handler runs instead when a tardy message led to it.
+    pub stp: bool,
+}
+
+/// Which of a reaction's functions runs.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Case {
+    /// The reaction itself.
+    Body,
+    /// The handler of a missed deadline.
+    Deadline,
+    /// The handler of a tardy message; a deadline missed as well does not matter then.
+    Stp,
 }
 
 /// A reaction's body.
 pub(crate) trait Body {
     fn link(&mut self, linker: &mut Linker<'_>);
 
-    fn run(&mut self, ctx: &mut Ctx, epoch: Epoch, late: bool, outcome: &mut Outcome<'_>);
+    fn run(&mut self, ctx: &mut Ctx, epoch: Epoch, case: Case, outcome: &mut Outcome<'_>);
 }
 
 struct TypedBody<R, A, F> {
@@ -404,15 +462,15 @@ struct TypedBody<R, A, F> {
     body: F,
 }
 
-impl<R, A: Args, F: FnMut(&mut R, &mut Ctx, &mut A, bool)> Body for TypedBody<R, A, F> {
+impl<R, A: Args, F: FnMut(&mut R, &mut Ctx, &mut A, Case)> Body for TypedBody<R, A, F> {
     fn link(&mut self, linker: &mut Linker<'_>) {
         self.args.link(linker);
     }
 
     #[inline]
-    fn run(&mut self, ctx: &mut Ctx, epoch: Epoch, late: bool, outcome: &mut Outcome<'_>) {
+    fn run(&mut self, ctx: &mut Ctx, epoch: Epoch, case: Case, outcome: &mut Outcome<'_>) {
         self.args.bind(epoch);
-        (self.body)(&mut self.state.write(), ctx, &mut self.args, late);
+        (self.body)(&mut self.state.write(), ctx, &mut self.args, case);
         self.args.release(outcome);
     }
 }

@@ -129,6 +129,12 @@ pub enum SimulateError {
         /// Its path.
         path: String,
     },
+    /// Handlers that run by the physical clock are not simulated.
+    #[error("the watchdog {path} goes by the physical clock, which the seed draws")]
+    Watchdog {
+        /// Its path.
+        path: String,
+    },
     /// A reaction panicked.
     #[error("reaction {} of {} panicked at {}: {}", .0.reaction, .0.path, .0.tag, .0.message)]
     Reaction(Fault),
@@ -311,7 +317,7 @@ impl Federation {
     ///
     /// # Errors
     ///
-    /// As [`Federation::alone`]; when there is a physical action; when a law of coordination is broken.
+    /// As [`Federation::alone`]; when there is a physical action or a watchdog; when a law of coordination is broken.
     pub fn simulate(&self, seed: u64) -> Result<Trace, SimulateError> {
         // What does not fit together is found in one program, with the better words.
         let all: Vec<u16> = (0..self.count()).collect();
@@ -374,6 +380,10 @@ impl Federation {
         if let Some((_, path)) = assembly.bodies.physical.first() {
             let path = path.clone();
             return Err(SimulateError::PhysicalAction { path });
+        }
+        if let Some(path) = assembly.bodies.watchdogs.first() {
+            let path = path.to_owned();
+            return Err(SimulateError::Watchdog { path });
         }
         let memory = Memory::default();
         assembly.bodies.observer = Some(Observer::in_memory(&assembly.program, &memory));
@@ -483,8 +493,16 @@ impl Executor for Simulated {
         self.bodies.arrive(action, slot, value);
     }
 
+    fn release(&mut self, action: ActionId, value: ValueId) {
+        self.bodies.release(action, value);
+    }
+
     fn run(&mut self, node: NodeId, tag: Tag, effects: &mut Effects) {
         self.bodies.run(node, tag, effects);
+    }
+
+    fn run_tardy(&mut self, node: NodeId, tag: Tag, intended: Tag, effects: &mut Effects) {
+        self.bodies.run_tardy(node, tag, intended, effects);
     }
 }
 
@@ -495,6 +513,14 @@ impl FederateExecutor for Simulated {
 
     fn decode(&mut self, input: InputId, payload: &[u8]) -> Result<ValueId, PayloadError> {
         self.bodies.decode(input, payload)
+    }
+
+    fn stamped(&mut self, action: ActionId, tag: Tag) {
+        self.bodies.note_physical(action, tag);
+    }
+
+    fn tardy(&mut self, input: InputId, intended: Tag, actual: Tag) {
+        self.bodies.note_tardy(input, intended, actual);
     }
 }
 

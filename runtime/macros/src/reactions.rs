@@ -65,13 +65,15 @@ pub(crate) fn expand(attributes: TokenStream, item: TokenStream) -> Result<Token
 fn step(method: &mut ImplItemFn) -> Result<Option<TokenStream>> {
     let reaction = take_attribute(&mut method.attrs, "reaction");
     let connections = take_attribute(&mut method.attrs, "connections");
-    match (reaction, connections) {
-        (None, None) => Ok(None),
-        (Some(attribute), None) => self::reaction(method, &attribute).map(Some),
-        (None, Some(attribute)) => self::connections(method, &attribute).map(Some),
-        (Some(_), Some(attribute)) => Err(Error::new_spanned(
+    let watchdog = take_attribute(&mut method.attrs, "watchdog");
+    match (reaction, connections, watchdog) {
+        (None, None, None) => Ok(None),
+        (Some(attribute), None, None) => self::reaction(method, &attribute).map(Some),
+        (None, Some(attribute), None) => self::connections(method, &attribute).map(Some),
+        (None, None, Some(attribute)) => self::watchdog(method, &attribute).map(Some),
+        (_, Some(attribute), _) | (Some(_), None, Some(attribute)) => Err(Error::new_spanned(
             attribute,
-            "a method is a reaction or makes connections, not both",
+            "a method is a reaction, a watchdog's handler, or makes connections: one of them",
         )),
     }
 }
@@ -89,12 +91,25 @@ struct ItemArgument {
     part: TokenStream,
     mutable: bool,
     ty: Type,
+    /// The last segment of the type's path.
+    kind: String,
+}
+
+/// What runs instead of a reaction.
+struct Handlers {
+    deadline: Option<Expr>,
+    late: Option<Expr>,
+    stp: Option<Expr>,
 }
 
 fn reaction(method: &mut ImplItemFn, attribute: &Attribute) -> Result<TokenStream> {
-    let mut options = Options::of(attribute, &["deadline", "late"])?;
-    let (deadline, late) = (options.take("deadline")?, options.take("late")?);
-    let arguments = arguments(method)?;
+    let mut options = Options::of(attribute, &["deadline", "late", "stp"])?;
+    let handlers = Handlers {
+        deadline: options.take("deadline")?,
+        late: options.take("late")?,
+        stp: options.take("stp")?,
+    };
+    let arguments = arguments(method, "a reaction")?;
     let triggered = arguments.iter().any(|argument| match argument {
         Argument::Context { .. } => false,
         Argument::Item(item) => item.role.starts_with("trigger"),
@@ -103,11 +118,8 @@ fn reaction(method: &mut ImplItemFn, attribute: &Attribute) -> Result<TokenStrea
         let message = "nothing triggers this reaction: take an input, a timer or an action by `&`, or an action by `#[trigger] name: &mut`";
         return Err(Error::new(method.sig.ident.span(), message));
     }
-    let (deadline, late) = match (deadline, late) {
-        (Some(deadline), Some(late)) => {
-            (quote!(::core::option::Option::Some(#deadline)), Some(late))
-        }
-        (None, None) => (quote!(::core::option::Option::None), None),
+    match (&handlers.deadline, &handlers.late) {
+        (Some(_), Some(_)) | (None, None) => {}
         (Some(deadline), None) => {
             let message =
                 "say what runs instead when the deadline is missed: `late = Self::handler`";
@@ -117,23 +129,89 @@ fn reaction(method: &mut ImplItemFn, attribute: &Attribute) -> Result<TokenStrea
             let message = "a handler needs a deadline: `deadline = 5.ms()`";
             return Err(Error::new_spanned(late, message));
         }
-    };
+    }
     let allow: Attribute = syn::parse_quote!(#[allow(clippy::too_many_arguments)]);
     method.attrs.push(allow);
-    Ok(registration(
-        &method.sig.ident,
-        &arguments,
-        &deadline,
-        late.as_ref(),
-    ))
+    Ok(registration(&method.sig.ident, &arguments, &handlers))
 }
 
-fn registration(
-    name: &Ident,
-    arguments: &[Argument],
-    deadline: &TokenStream,
-    late: Option<&Expr>,
-) -> TokenStream {
+fn registration(name: &Ident, arguments: &[Argument], handlers: &Handlers) -> TokenStream {
+    let Items {
+        accesses,
+        pattern,
+        passed,
+    } = items(arguments);
+    let instead = |case: &str, handler: &Option<Expr>| {
+        let handler = handler.as_ref()?;
+        let case = Ident::new(case, handler.span());
+        Some(quote_spanned! {handler.span()=>
+            if case == ::ictus::build::Case::#case {
+                return (#handler)(state #(, #passed)*);
+            }
+        })
+    };
+    let late = instead("Deadline", &handlers.late);
+    let stp = instead("Stp", &handlers.stp);
+    let deadline = match &handlers.deadline {
+        Some(deadline) => quote!(::core::option::Option::Some(#deadline)),
+        None => quote!(::core::option::Option::None),
+    };
+    let (text, has_stp) = (name.to_string(), handlers.stp.is_some());
+    quote! {
+        scope.reaction(
+            #text,
+            ::ictus::build::Handlers { deadline: #deadline, stp: #has_stp },
+            #accesses,
+            |state, ctx, items, case| {
+                let #pattern = items;
+                #late
+                #stp
+                Self::#name(state #(, #passed)*)
+            },
+        );
+    }
+}
+
+/// A watchdog's handler.
+fn watchdog(method: &mut ImplItemFn, attribute: &Attribute) -> Result<TokenStream> {
+    let Meta::List(list) = &attribute.meta else {
+        let message = "name the watchdog: `#[watchdog(guard)]`";
+        return Err(Error::new_spanned(attribute, message));
+    };
+    let watchdog: Ident = list.parse_args()?;
+    let arguments = arguments(method, "a watchdog's handler")?;
+    for argument in &arguments {
+        if let Argument::Item(item) = argument
+            && !(item.kind == "PhysicalAction" && item.role == "effect")
+        {
+            let message = "a watchdog's handler runs at no tag: it takes `&mut Ctx` and actions as `&mut PhysicalAction<..>`";
+            return Err(Error::new_spanned(&item.ty, message));
+        }
+    }
+    let Items {
+        accesses,
+        pattern,
+        passed,
+    } = items(&arguments);
+    let name = &method.sig.ident;
+    let text = name.to_string();
+    let part = quote_spanned!(watchdog.span()=> parts.#watchdog);
+    Ok(quote! {
+        scope.watchdog(&#part, #text, #accesses, |state, ctx, items| {
+            let #pattern = items;
+            Self::#name(state #(, #passed)*)
+        });
+    })
+}
+
+/// The items of a signature: as a value of `Args`, as a pattern for it, and as arguments of a call.
+struct Items {
+    accesses: TokenStream,
+    pattern: TokenStream,
+    passed: Vec<TokenStream>,
+}
+
+fn items(arguments: &[Argument]) -> Items {
     let mut accesses = quote!(());
     let mut pattern = quote!(());
     for (i, argument) in arguments.iter().enumerate().rev() {
@@ -145,25 +223,11 @@ fn registration(
             pattern = quote!((#binding, #pattern));
         }
     }
-    let passed: Vec<_> = arguments
-        .iter()
-        .enumerate()
-        .map(|(i, argument)| passed(i, argument))
-        .collect();
-    let late = late.map(|late| {
-        quote_spanned! {late.span()=>
-            if late {
-                return (#late)(state #(, #passed)*);
-            }
-        }
-    });
-    let text = name.to_string();
-    quote! {
-        scope.reaction(#text, #deadline, #accesses, |state, ctx, items, late| {
-            let #pattern = items;
-            #late
-            Self::#name(state #(, #passed)*)
-        });
+    let passed = arguments.iter().enumerate();
+    Items {
+        accesses,
+        pattern,
+        passed: passed.map(|(i, argument)| self::passed(i, argument)).collect(),
     }
 }
 
@@ -182,18 +246,18 @@ fn passed(i: usize, argument: &Argument) -> TokenStream {
     }
 }
 
-fn arguments(method: &mut ImplItemFn) -> Result<Vec<Argument>> {
+fn arguments(method: &mut ImplItemFn, what: &str) -> Result<Vec<Argument>> {
     let signature = &mut method.sig;
     if let ReturnType::Type(_, ty) = &signature.output {
         return Err(Error::new_spanned(
             ty,
-            "a reaction returns nothing: set an output instead",
+            format!("{what} returns nothing: set an output or schedule an action instead"),
         ));
     }
     if let Some(token) = &signature.asyncness {
         return Err(Error::new_spanned(
             token,
-            "a reaction runs to its end: it cannot be async",
+            format!("{what} runs to its end: it cannot be async"),
         ));
     }
     let name = signature.ident.clone();
@@ -201,7 +265,8 @@ fn arguments(method: &mut ImplItemFn) -> Result<Vec<Argument>> {
     match inputs.next() {
         Some(FnArg::Receiver(_)) => {}
         Some(FnArg::Typed(_)) | None => {
-            let message = "a reaction takes `&mut self` first: its reactor's parameters and state";
+            let message =
+                format!("{what} takes `&mut self` first: its reactor's parameters and state");
             return Err(Error::new(name.span(), message));
         }
     }
@@ -243,6 +308,7 @@ fn argument(typed: &mut PatType) -> Result<Argument> {
         part: part(typed, &kind, of.as_ref(), mutable)?,
         mutable,
         ty: (*typed.ty).clone(),
+        kind,
     })))
 }
 
@@ -252,6 +318,7 @@ fn check_kind(kind: &str, mutable: bool, at: &Type) -> Result<()> {
         ("Output", false) => "an output is set: take it as `&mut Output<..>`",
         ("Timer", true) => "a timer is read: take it as `&Timer`",
         ("Startup" | "Shutdown", true) => "take it by `&`",
+        ("Watchdog", false) => "a watchdog is started and stopped: take it as `&mut Watchdog`",
         _ => return Ok(()),
     };
     Err(Error::new_spanned(at, message))

@@ -5,6 +5,7 @@ mod given;
 
 use crate::options::{Options, take_attribute};
 use proc_macro2::TokenStream;
+use syn::spanned::Spanned;
 use syn::{
     Attribute, Error, Expr, Field, Fields, GenericArgument, Ident, ItemStruct, Meta, PathArguments,
     Result, Type, parse2,
@@ -73,12 +74,10 @@ enum Kind {
         offset: Option<Expr>,
         period: Option<Expr>,
     },
-    Logical {
-        min_delay: Option<Expr>,
-    },
-    Physical {
-        min_delay: Option<Expr>,
-        min_spacing: Option<Expr>,
+    Logical(Action),
+    Physical(Action),
+    Watchdog {
+        timeout: Expr,
     },
     Child {
         class: Type,
@@ -89,6 +88,15 @@ enum Kind {
         given: Option<Expr>,
         width: Expr,
     },
+}
+
+/// The options of an action.
+#[derive(Default)]
+struct Action {
+    min_delay: Option<Expr>,
+    min_spacing: Option<Expr>,
+    /// A variant of `SpacingPolicy`.
+    policy: Option<Ident>,
 }
 
 impl Kind {
@@ -130,6 +138,7 @@ struct OwnAttributes {
     state: Option<Attribute>,
     timer: Option<Attribute>,
     action: Option<Attribute>,
+    watchdog: Option<Attribute>,
     child: Option<Attribute>,
     width: Option<Attribute>,
     bank_index: Option<Attribute>,
@@ -143,6 +152,7 @@ impl OwnAttributes {
             state: take("state"),
             timer: take("timer"),
             action: take("action"),
+            watchdog: take("watchdog"),
             child: take("child"),
             width: take("width"),
             bank_index: take("bank_index"),
@@ -170,8 +180,9 @@ impl OwnAttributes {
             "Input" => Kind::Input,
             "Output" => Kind::Output,
             "Timer" => self.timer(ty)?,
-            "LogicalAction" => self.logical()?,
-            "PhysicalAction" => self.physical()?,
+            "LogicalAction" => Kind::Logical(self.action(false)?),
+            "PhysicalAction" => Kind::Physical(self.action(true)?),
+            "Watchdog" => self.watchdog(ty)?,
             "Multi" => self.multi(ty, inner.as_ref())?,
             "Child" => Kind::Child {
                 class: inner
@@ -202,26 +213,41 @@ impl OwnAttributes {
         })
     }
 
-    fn logical(&mut self) -> Result<Kind> {
-        let min_delay = match self.action.take() {
-            Some(attribute) => Options::of(&attribute, &["min_delay"])?.take("min_delay")?,
-            None => None,
+    fn action(&mut self, physical: bool) -> Result<Action> {
+        let Some(attribute) = self.action.take() else {
+            return Ok(Action::default());
         };
-        Ok(Kind::Logical { min_delay })
+        let known: &[_] = if physical {
+            &["physical", "min_delay", "min_spacing", "policy"]
+        } else {
+            &["min_delay", "min_spacing", "policy"]
+        };
+        let mut options = Options::of(&attribute, known)?;
+        let action = Action {
+            min_delay: options.take("min_delay")?,
+            min_spacing: options.take("min_spacing")?,
+            policy: options.take("policy")?.as_ref().map(policy).transpose()?,
+        };
+        match &action {
+            Action {
+                policy: Some(policy),
+                min_spacing: None,
+                ..
+            } => {
+                let message = "a policy is for events that come too soon: `min_spacing = 1.ms()`";
+                Err(Error::new(policy.span(), message))
+            }
+            _ => Ok(action),
+        }
     }
 
-    fn physical(&mut self) -> Result<Kind> {
-        let (mut min_delay, mut min_spacing) = (None, None);
-        if let Some(attribute) = self.action.take() {
-            let known = ["physical", "min_delay", "min_spacing"];
-            let mut options = Options::of(&attribute, &known)?;
-            min_delay = options.take("min_delay")?;
-            min_spacing = options.take("min_spacing")?;
-        }
-        Ok(Kind::Physical {
-            min_delay,
-            min_spacing,
-        })
+    fn watchdog(&mut self, ty: &Type) -> Result<Kind> {
+        let message = "say when it expires: `#[watchdog(timeout = 100.ms())]`";
+        let attribute = self.watchdog.take();
+        let attribute = attribute.ok_or_else(|| Error::new_spanned(ty, message))?;
+        let timeout = Options::of(&attribute, &["timeout"])?.take("timeout")?;
+        let timeout = timeout.ok_or_else(|| Error::new_spanned(attribute, message))?;
+        Ok(Kind::Watchdog { timeout })
     }
 
     fn multi(&mut self, ty: &Type, inner: Option<&Type>) -> Result<Kind> {
@@ -263,6 +289,7 @@ impl OwnAttributes {
             self.state,
             self.timer,
             self.action,
+            self.watchdog,
             self.child,
             self.width,
             self.bank_index,
@@ -275,6 +302,22 @@ impl OwnAttributes {
             )),
         }
     }
+}
+
+/// The variant that `policy = drop` names.
+fn policy(given: &Expr) -> Result<Ident> {
+    let name = match given {
+        Expr::Path(path) => path.path.get_ident(),
+        _ => None,
+    };
+    let variants = [("defer", "Defer"), ("drop", "Drop"), ("replace", "Replace")];
+    let variant = variants
+        .iter()
+        .find(|(text, _)| name.is_some_and(|name| name == text));
+    let message = "what becomes of an event that comes too soon: `defer`, `drop` or `replace`";
+    variant
+        .map(|(_, variant)| Ident::new(variant, given.span()))
+        .ok_or_else(|| Error::new_spanned(given, message))
 }
 
 /// The last segment of a type's path and its first type argument.

@@ -1,7 +1,7 @@
 //! Runs reactors in this process, as fast as they go, with a clock that the test moves.
 
 use ictus::value::digest_of;
-use ictus::{Assembly, AssemblyError, Class, Clock, Fault, Observation, Value};
+use ictus::{Assembly, AssemblyError, Class, Clock, Counters, Fault, Observation, Value};
 use ictus_coord::plan::{ConnectionPlan, Endpoint, FederatePlan, Plan};
 use ictus_core::{
     Duration, Effects, Executor, LogicalTime, NodeId, PhysicalTime, Progress, Tag, Timeline,
@@ -43,6 +43,7 @@ pub struct Ran {
     pub fault: Option<Fault>,
     pub end: Tag,
     pub deadlines_missed: u64,
+    pub counters: Counters,
     /// Per federate, in the order of the plan: the trace without its last line.
     pub traces: Vec<String>,
 }
@@ -157,6 +158,7 @@ impl World {
             fault: bodies.fault().cloned(),
             end,
             deadlines_missed: bodies.counters().deadlines_missed,
+            counters: bodies.counters(),
             traces: self
                 .plan
                 .federates
@@ -169,47 +171,66 @@ impl World {
 
 /// The loop of one process, without waiting.
 fn drive(timeline: &mut Timeline, bodies: &mut ictus::Bodies, clock: &TestClock) {
-    let mut effects = Effects::default();
-    let (mut batch, mut present) = (Vec::<NodeId>::new(), Vec::new());
-    let mut events = Vec::new();
-    let program = Arc::clone(timeline.program());
     loop {
-        bodies.drain_outside(&mut events);
-        for event in events.drain(..) {
-            let tag =
-                timeline.schedule_physical(event.stamp, event.action, event.value, Tag::NEVER);
-            bodies.note_physical(event.action, tag);
-        }
+        let mut stop = bodies.fire_watchdogs(clock.now()).stop;
+        take_outside(timeline, bodies);
         let mut tag = timeline.next_tag();
         if tag == Tag::FOREVER {
             // Starvation: without keepalive, the tag after the last one is the stop tag.
             tag = timeline.at().next_microstep().unwrap();
+            stop = true;
+        }
+        if stop {
             timeline.stop_at(tag);
         }
-        bodies.begin(tag);
-        timeline.begin(tag, &mut present);
-        for (action, value) in present.drain(..) {
-            bodies.arrive(action, program.action_slot(action), value);
-        }
-        while timeline.ready(&mut batch) == Progress::Batch {
-            for node in &batch {
-                bodies.run(*node, tag, &mut effects);
-            }
-            timeline.finish(&batch, &mut effects);
-            batch.clear();
-            for (action, value) in effects.physical.drain(..) {
-                let tag = timeline.schedule_physical(clock.now(), action, value, Tag::NEVER);
-                bodies.note_physical(action, tag);
-            }
-            if std::mem::take(&mut effects.stop) {
-                timeline.stop_at(tag.next_microstep().unwrap());
-            }
-        }
-        timeline.complete();
+        run_tag(timeline, bodies, clock);
         if timeline.finished() || bodies.fault().is_some() {
             return;
         }
     }
+}
+
+/// Schedules what threads and handlers sent.
+pub fn take_outside(timeline: &mut Timeline, bodies: &mut ictus::Bodies) {
+    let mut events = Vec::new();
+    bodies.drain_outside(&mut events);
+    for event in events {
+        let tag = timeline.schedule_physical(event.stamp, event.action, event.value, Tag::NEVER);
+        bodies.note_physical(event.action, tag);
+    }
+    while let Some((action, value)) = timeline.pop_released() {
+        bodies.release(action, value);
+    }
+}
+
+/// Runs the next tag.
+pub fn run_tag(timeline: &mut Timeline, bodies: &mut ictus::Bodies, clock: &TestClock) {
+    let program = Arc::clone(timeline.program());
+    let tag = timeline.next_tag();
+    let (mut batch, mut present) = (Vec::<NodeId>::new(), Vec::new());
+    let mut effects = Effects::default();
+    bodies.begin(tag);
+    timeline.begin(tag, &mut present);
+    for (action, value) in present {
+        bodies.arrive(action, program.action_slot(action), value);
+    }
+    while timeline.ready(&mut batch) == Progress::Batch {
+        for node in batch.drain(..) {
+            match timeline.tardy(node) {
+                None => bodies.run(node, tag, &mut effects),
+                Some(intended) => bodies.run_tardy(node, tag, intended, &mut effects),
+            }
+            timeline.finish(&[node], &mut effects);
+        }
+        for (action, value) in effects.physical.drain(..) {
+            let tag = timeline.schedule_physical(clock.now(), action, value, Tag::NEVER);
+            bodies.note_physical(action, tag);
+        }
+        if std::mem::take(&mut effects.stop) {
+            timeline.stop_at(tag.next_microstep().unwrap());
+        }
+    }
+    timeline.complete();
 }
 
 fn trace(directory: &Path, federate: &str) -> String {
@@ -234,6 +255,11 @@ pub fn line(when: (Duration, u32), reaction: (&str, u32), effects: &[(&str, u64)
 /// As [`line`] for a deadline handler.
 pub fn late(when: (Duration, u32), reaction: (&str, u32), effects: &[(&str, u64)]) -> String {
     record(when, reaction, "deadline", effects)
+}
+
+/// As [`line`] for an STP handler.
+pub fn stp(when: (Duration, u32), reaction: (&str, u32), effects: &[(&str, u64)]) -> String {
+    record(when, reaction, "stp", effects)
 }
 
 fn record(

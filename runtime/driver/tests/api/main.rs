@@ -18,5 +18,8 @@ mod physical;
 mod ports;
 #[cfg(feature = "simulate")]
 mod simulating;
+mod spacing;
+mod stp;
 mod time;
 mod values;
+mod watchdogs;

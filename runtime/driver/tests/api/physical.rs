@@ -164,12 +164,12 @@ fn fast_is_refused_with_what_the_physical_clock_schedules() {
     for mine in [&[0][..], &[1], &[0, 1]] {
         assert_eq!(
             connection.assemble_some(mine).unwrap_err().to_string(),
-            "`fast`, but the physical connection to `echo.input` is scheduled by the physical clock"
+            "`fast`, but the physical connection to `echo.input` goes by the physical clock"
         );
     }
     let action = World::of(Class::of::<Once>()).fast();
     assert_eq!(
         action.assemble().unwrap_err().to_string(),
-        "`fast`, but the physical action `main.event` is scheduled by the physical clock"
+        "`fast`, but the physical action `main.event` goes by the physical clock"
     );
 }

@@ -1,6 +1,6 @@
 //! The code that `#[reactor]` expands to.
 
-use super::{Kind, Member, given};
+use super::{Action, Kind, Member, given};
 use proc_macro2::{Span, TokenStream, TokenTree};
 use quote::{ToTokens, format_ident, quote, quote_spanned};
 use syn::spanned::Spanned;
@@ -446,16 +446,17 @@ impl<'a> Class<'a> {
                 let (offset, period) = (duration(offset), duration(period));
                 quote!(__scope.timer(#offset, #period))
             }
-            Kind::Logical { min_delay } => {
-                let min_delay = duration(min_delay);
-                quote!(__scope.logical_action(#text, #min_delay))
+            Kind::Logical(action) => {
+                let (min_delay, spacing) = (duration(&action.min_delay), self.spacing(action));
+                quote!(__scope.logical_action(#text, #min_delay, #spacing))
             }
-            Kind::Physical {
-                min_delay,
-                min_spacing,
-            } => {
-                let (min_delay, min_spacing) = (duration(min_delay), duration(min_spacing));
-                quote!(__scope.physical_action(#text, #min_delay, #min_spacing))
+            Kind::Physical(action) => {
+                let (min_delay, spacing) = (duration(&action.min_delay), self.spacing(action));
+                quote!(__scope.physical_action(#text, #min_delay, #spacing))
+            }
+            Kind::Watchdog { timeout } => {
+                let timeout = over(timeout);
+                quote!(__scope.watchdog(#text, #timeout))
             }
             Kind::Child { class, given } => {
                 let given = self.with_parameters(&given::parameters(class, given.as_ref()));
@@ -483,6 +484,18 @@ impl<'a> Class<'a> {
             }
         };
         quote!(let #name: #ty = #value;)
+    }
+
+    fn spacing(&self, action: &Action) -> TokenStream {
+        let Some(min) = &action.min_spacing else {
+            return quote!(::ictus::build::Spacing::NONE);
+        };
+        let min = self.over_parameters(min);
+        let policy = match &action.policy {
+            Some(policy) => quote!(::ictus::build::SpacingPolicy::#policy),
+            None => quote!(::ictus::build::SpacingPolicy::Defer),
+        };
+        quote!(::ictus::build::Spacing { min: #min, policy: #policy })
     }
 
     fn over_parameters(&self, expr: &Expr) -> TokenStream {

@@ -3,7 +3,7 @@
 use super::{FederateSpec, Federation, LinkSpec, PortRef, ReactionPlan, ReactorSpec, WireSpec};
 use crate::seed::Rng;
 use crate::swarm::{Ending, Shape, Swarm};
-use ictus_core::{ActionKind, Delay, Duration, DurationExt as _, ProgramError};
+use ictus_core::{ActionKind, Delay, Duration, DurationExt as _, ProgramError, Spacing};
 
 /// Tags fall on multiples of this, so that federates meet at them.
 const GRAIN: i64 = 500_000;
@@ -297,6 +297,7 @@ impl Draft {
         if rng.percent(30) {
             inner.actions.push(ActionKind::Logical {
                 min_delay: Duration::ZERO,
+                spacing: Spacing::NONE,
             });
         }
         self.draw_reactions(&mut inner, rng);
@@ -323,12 +324,18 @@ impl Draft {
         }
         if rng.percent(45) {
             let min_delay = grains(*rng.pick(&[0, 0, 1, 3]));
-            reactor.actions.push(ActionKind::Logical { min_delay });
+            reactor.actions.push(ActionKind::Logical {
+                min_delay,
+                spacing: Spacing::NONE,
+            });
         }
         if self.shape.physical && rng.percent(35) {
             reactor.actions.push(ActionKind::Physical {
                 min_delay: *rng.pick(&[Duration::ZERO, 1.ms(), 300.us()]),
-                min_spacing: *rng.pick(&[Duration::ZERO, Duration::ZERO, 2.ms()]),
+                spacing: Spacing {
+                    min: *rng.pick(&[Duration::ZERO, Duration::ZERO, 2.ms()]),
+                    ..Spacing::NONE
+                },
             });
         }
     }

@@ -174,7 +174,7 @@ impl<E: SimulatedExecutor> Host<E> {
         let program = self.federate.timeline().program();
         let ActionKind::Physical {
             min_delay,
-            min_spacing,
+            spacing,
         } = program.actions()[action.index()]
         else {
             return false;
@@ -185,7 +185,7 @@ impl<E: SimulatedExecutor> Host<E> {
             .reading(now)
             .saturating_add(min_delay)
             .as_logical();
-        let spaced = last.map_or(start, |tag| tag.time + min_spacing);
+        let spaced = last.map_or(start, |tag| tag.time + spacing.min);
         tag.time > by_now.max(spaced).max(start)
     }
 
