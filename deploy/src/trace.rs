@@ -20,6 +20,10 @@ pub struct FederateTrace {
     pub records: Vec<Record>,
     /// Physical events, which no other run repeats.
     pub physical: Vec<(TraceTag, String)>,
+    /// Watchdogs that expired, which no other run repeats: with the tag of the record before.
+    pub watchdogs: Vec<(TraceTag, String)>,
+    /// Messages that came after their tag had been handled without them: with that tag, and the input.
+    pub tardy: Vec<(TraceTag, String)>,
     /// The tag of a stop by request.
     pub stop: Option<TraceTag>,
     /// Where and why the trace ended; absent when the federate was cut off.
@@ -44,7 +48,7 @@ pub struct Record {
     pub path: String,
     /// The reaction's position in its reactor.
     pub index: u32,
-    /// `body` or `deadline`.
+    /// `body`, `deadline` or `stp`.
     pub kind: String,
     /// Outputs written and actions scheduled with the digests of their values.
     pub effects: String,
@@ -162,23 +166,32 @@ impl TraceSet {
         let mut seen: BTreeSet<String> = BTreeSet::new();
         let mut stop = None;
         let mut end = None;
+        let mut last = TraceTag::default();
         for (index, line) in text.lines().enumerate() {
             let wrong = |what| (index + 1, what);
             if let Some(comment) = line.strip_prefix('#') {
-                match Comment::parse(comment).map_err(wrong)? {
-                    Comment::Physical(tag, path) => {
-                        let federate = federate_of(&path).to_owned();
-                        let trace = self.federates.entry(federate.clone()).or_default();
-                        trace.physical.push((tag, path));
-                        seen.insert(federate);
+                let (path, (tag, of)) = match Comment::parse(comment).map_err(wrong)? {
+                    Comment::Physical(tag, path) => (path, (tag, Events::Physical)),
+                    Comment::Watchdog(path) => (path, (last, Events::Watchdogs)),
+                    Comment::Tardy(intended, path) => (path, (intended, Events::Tardy)),
+                    Comment::Stop(tag) => {
+                        stop = Some(tag);
+                        continue;
                     }
-                    Comment::Stop(tag) => stop = Some(tag),
-                    Comment::End(tag, reason) => end = Some((tag, reason)),
-                    Comment::Other => {}
-                }
+                    Comment::End(tag, reason) => {
+                        end = Some((tag, reason));
+                        continue;
+                    }
+                    Comment::Other => continue,
+                };
+                let federate = federate_of(&path).to_owned();
+                let trace = self.federates.entry(federate.clone()).or_default();
+                trace.events(of).push((tag, path));
+                seen.insert(federate);
             } else if !line.is_empty() {
                 let record = Record::parse(line).map_err(wrong)?;
                 let federate = federate_of(&record.path).to_owned();
+                last = record.tag;
                 self.federates
                     .entry(federate.clone())
                     .or_default()
@@ -201,7 +214,27 @@ impl TraceSet {
     fn sort(&mut self) {
         for trace in self.federates.values_mut() {
             trace.records.sort();
-            trace.physical.sort();
+            for of in [Events::Physical, Events::Watchdogs, Events::Tardy] {
+                trace.events(of).sort();
+            }
+        }
+    }
+}
+
+/// A kind of event that no other run repeats.
+#[derive(Clone, Copy)]
+enum Events {
+    Physical,
+    Watchdogs,
+    Tardy,
+}
+
+impl FederateTrace {
+    fn events(&mut self, of: Events) -> &mut Vec<(TraceTag, String)> {
+        match of {
+            Events::Physical => &mut self.physical,
+            Events::Watchdogs => &mut self.watchdogs,
+            Events::Tardy => &mut self.tardy,
         }
     }
 }
@@ -309,21 +342,42 @@ fn first_difference<'a>(
 /// Why a difference proves nothing: something that no run repeats came before it.
 fn excuse(a: &TraceSet, b: &TraceSet, difference: &Difference<'_>) -> Option<Verdict> {
     let tag = difference.tag();
+    let because = |why| Some(Verdict::NotComparable { why });
+    let tardy = traces(a, b).find(|(_, trace)| trace.tardy.iter().any(|(at, _)| *at <= tag));
+    if let Some((federate, trace)) = tardy {
+        let (count, first) = (trace.tardy.len(), &trace.tardy[0]);
+        return because(format!(
+            "a message was tardy before the runs differ: `{federate}` had {count} tardy in one run, the first for {} at {}",
+            first.1, first.0
+        ));
+    }
     let deadline = records(a)
         .chain(records(b))
         .find(|r| r.kind == "deadline" && r.tag <= tag);
     if let Some(record) = deadline {
         let why = format!("a deadline was missed before the runs differ: {record}");
-        return Some(Verdict::NotComparable { why });
+        return because(why);
     }
-    let physical = a
-        .federates
-        .values()
-        .chain(b.federates.values())
-        .flat_map(|t| &t.physical);
-    let (at, path) = physical.filter(|(at, _)| *at <= tag).min()?;
-    let why = format!("a physical event came before the runs differ: {path} at {at}");
-    Some(Verdict::NotComparable { why })
+    let before = |events: &&(TraceTag, String)| events.0 <= tag;
+    let watchdogs = traces(a, b).flat_map(|(_, trace)| &trace.watchdogs);
+    if let Some((at, path)) = watchdogs.filter(before).min() {
+        return because(format!(
+            "a watchdog fired before the runs differ: {path} after {at}"
+        ));
+    }
+    let physical = traces(a, b).flat_map(|(_, trace)| &trace.physical);
+    let (at, path) = physical.filter(before).min()?;
+    because(format!(
+        "a physical event came before the runs differ: {path} at {at}"
+    ))
+}
+
+/// The traces of both runs.
+fn traces<'a>(
+    a: &'a TraceSet,
+    b: &'a TraceSet,
+) -> impl Iterator<Item = (&'a String, &'a FederateTrace)> {
+    a.federates.iter().chain(&b.federates)
 }
 
 fn records(set: &TraceSet) -> impl Iterator<Item = &Record> {
@@ -342,6 +396,9 @@ fn federate_of(path: &str) -> &str {
 /// A line that starts with `#`.
 enum Comment {
     Physical(TraceTag, String),
+    Watchdog(String),
+    /// With the tag at which it should have been handled.
+    Tardy(TraceTag, String),
     Stop(TraceTag),
     End(TraceTag, String),
     Other,
@@ -351,10 +408,19 @@ impl Comment {
     fn parse(text: &str) -> Result<Self, &'static str> {
         let mut words = text.split_whitespace();
         let kind = words.next();
-        if !matches!(kind, Some("physical" | "stop" | "end")) {
+        if kind == Some("watchdog") {
+            words.next();
+            return Ok(Self::Watchdog(words.next().ok_or("no path")?.to_owned()));
+        }
+        if !matches!(kind, Some("physical" | "tardy" | "stop" | "end")) {
             return Ok(Self::Other);
         }
         let tag = TraceTag::parse(words.next(), words.next())?;
+        if kind == Some("tardy") {
+            let path = words.next().ok_or("no path")?.to_owned();
+            let intended = TraceTag::parse(words.next(), words.next())?;
+            return Ok(Self::Tardy(intended, path));
+        }
         let rest = words.collect::<Vec<_>>().join(" ");
         Ok(match kind {
             Some("physical") => Self::Physical(tag, rest),
@@ -381,8 +447,8 @@ impl Record {
         if fields.next().is_some() {
             return Err("more than six fields");
         }
-        if !matches!(kind, "body" | "deadline") {
-            return Err("the kind is neither `body` nor `deadline`");
+        if !matches!(kind, "body" | "deadline" | "stp") {
+            return Err("the kind is none of `body`, `deadline` and `stp`");
         }
         let (path, kind, effects) = (path.to_owned(), kind.to_owned(), effects.to_owned());
         Ok(Self {
@@ -559,9 +625,36 @@ mod tests {
         assert!(why(A, &A.replace("1 body", "1 deadline")).contains("deadline"));
         let physical = format!("# physical 5 0 a.button\n{}", A.replace("5 0", "6 0"));
         assert!(why(A, &physical).contains("a.button at (5 ns, 0)"));
+        let later = A.replace("5 0", "6 0");
+        let watchdog = later.replace("6 0", "# watchdog 700 a.guard\n6 0");
+        assert!(
+            why(A, &watchdog)
+                .contains("a watchdog fired before the runs differ: a.guard after (0 ns, 0)")
+        );
+        let tardy = format!("# tardy 6 0 a.in 5 0\n# tardy 8 1 a.in 7 0\n{later}");
+        assert!(
+            why(&tardy, A).contains("`a` had 2 tardy in one run, the first for a.in at (5 ns, 0)")
+        );
         assert!(why(A, &format!("# stop 5 0\n{}", A.replace("5 0", "6 0"))).contains("by request"));
         let undigested = A.replace("=0000000000000001", "=?");
         assert!(why(&undigested, &undigested).contains("no digest"));
+    }
+
+    #[test]
+    fn what_came_after_the_difference_does_not_excuse_it() {
+        let later = A.replace("5 0", "6 0");
+        for line in [
+            "# watchdog 700 a.guard",
+            "# tardy 8 1 a.in 7 0",
+            "# physical 7 0 a.button",
+        ] {
+            let text = later.replace("# end", &format!("{line}\n# end"));
+            let verdict = compare(&set(&[("a", A)]), &set(&[("a", &text)]));
+            assert!(
+                matches!(verdict, Verdict::Different { .. }),
+                "{line}: {verdict}"
+            );
+        }
     }
 
     #[test]

@@ -400,6 +400,9 @@ impl Federate {
     pub fn poll(&mut self, now: PhysicalTime, executor: &mut impl FederateExecutor) -> Poll {
         self.launch(now);
         self.now = now;
+        while let Some((action, value)) = self.timeline.pop_released() {
+            executor.release(action, value);
+        }
         match self.phase {
             Phase::Running => self.poll_until_explained(now, executor),
             Phase::Meeting => self.meet(now),

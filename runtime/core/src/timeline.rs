@@ -417,10 +417,7 @@ impl Timeline {
         let after_current = self.state.at.successor();
         let last = self.state.latest[action.index()];
         let after_last = last.next_microstep().unwrap_or(Tag::NEVER);
-        let tag = wanted
-            .max(after_current)
-            .max(floor)
-            .max(self.state.start);
+        let tag = wanted.max(after_current).max(floor).max(self.state.start);
         if spacing.min > Duration::ZERO {
             self.state.enqueue_spaced(tag, spacing, action, value)
         } else {

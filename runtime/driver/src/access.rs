@@ -89,10 +89,10 @@ pub trait Item: Clone + 'static {
 )]
 pub trait Readable: Item {}
 
-/// Items that a reaction can set or schedule.
+/// Items that a reaction can set, schedule or start.
 #[diagnostic::on_unimplemented(
     message = "a reaction cannot set or schedule `{Self}`",
-    label = "only outputs and actions are taken by `&mut`",
+    label = "only outputs, actions and watchdogs are taken by `&mut`",
     note = "an input is taken as `&Input<..>`, a timer as `&Timer`"
 )]
 pub trait Writable: Item {}

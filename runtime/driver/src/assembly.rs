@@ -327,7 +327,12 @@ impl<'a> Assembler<'a> {
         }
         let action = self.elaboration.physical.first().map(|(_, path)| path);
         let action = action.map(|path| ("the physical action", path.clone()));
-        let watchdog = || Some(("the watchdog", self.elaboration.watchdogs.first()?.to_owned()));
+        let watchdog = || {
+            Some((
+                "the watchdog",
+                self.elaboration.watchdogs.first()?.to_owned(),
+            ))
+        };
         let found = action.or_else(watchdog);
         found.map_or(Ok(()), |(what, path)| {
             Err(AssemblyError::Fast { what, path })

@@ -112,24 +112,6 @@ impl Bodies {
         }));
     }
 
-    /// Notes in the trace that a physical event got `tag`.
-    pub fn note_physical(&mut self, action: ActionId, tag: Tag) {
-        if let Some(observer) = &mut self.observer
-            && let Some((_, path)) = self.physical.iter().find(|(a, _)| *a == action)
-        {
-            observer.physical(self.ctx.start, tag, path);
-        }
-    }
-
-    /// Notes in the trace that a message for `input` is handled at `actual` instead of at `intended`.
-    pub fn note_tardy(&mut self, input: InputId, intended: Tag, actual: Tag) {
-        if let Some(observer) = &mut self.observer {
-            let port = self.program.network_inputs()[input.index()].port;
-            let path = self.program.port_path(port);
-            observer.tardy(self.ctx.start, (intended, actual), &path);
-        }
-    }
-
     /// When the next watchdog expires: then [`Bodies::fire_watchdogs`] is due, whatever tag is executed or waited for.
     #[inline]
     #[must_use]
@@ -368,12 +350,20 @@ impl FederateExecutor for Bodies {
         })
     }
 
-    fn stamped(&mut self, action: ActionId, tag: Tag) {
-        self.note_physical(action, tag);
+    fn note_physical(&mut self, action: ActionId, tag: Tag) {
+        if let Some(observer) = &mut self.observer
+            && let Some((_, path)) = self.physical.iter().find(|(a, _)| *a == action)
+        {
+            observer.physical(self.ctx.start, tag, path);
+        }
     }
 
-    fn tardy(&mut self, input: InputId, intended: Tag, actual: Tag) {
-        self.note_tardy(input, intended, actual);
+    fn note_tardy(&mut self, input: InputId, intended: Tag, actual: Tag) {
+        if let Some(observer) = &mut self.observer {
+            let port = self.program.network_inputs()[input.index()].port;
+            let path = self.program.port_path(port);
+            observer.tardy(self.ctx.start, (intended, actual), &path);
+        }
     }
 }
 

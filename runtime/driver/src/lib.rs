@@ -137,6 +137,59 @@
 //! # fn main() {}
 //! ```
 //!
+//! # Faults that a reactor can handle
+//!
+//! A reaction that starts too late runs its deadline handler (`late`), one that a tardy message led to its STP handler (`stp`).
+//! A watchdog needs no tag: its handler runs at a physical time, also while the federate waits for others.
+//!
+//! ```
+//! # use ictus::prelude::*;
+//! #[reactor]
+//! pub struct Brake {
+//!     distance: Input<f64>,
+//!     #[watchdog(timeout = 200.ms())]
+//!     silence: Watchdog,
+//!     #[action(min_spacing = 10.ms(), policy = drop)]
+//!     alarm: PhysicalAction<()>,
+//!     force: Output<f64>,
+//! }
+//!
+//! #[reactions]
+//! impl Brake {
+//!     #[reaction(deadline = 5.ms(), late = Self::full, stp = Self::tardy)]
+//!     fn brake(
+//!         &mut self,
+//!         _: &mut Ctx,
+//!         distance: &Input<f64>,
+//!         silence: &mut Watchdog,
+//!         force: &mut Output<f64>,
+//!     ) {
+//!         silence.start(0.ms());
+//!         force.set(distance.get().map_or(1.0, |distance| 1.0 / distance));
+//!     }
+//!
+//!     fn full(&mut self, _: &mut Ctx, _: &Input<f64>, _: &mut Watchdog, force: &mut Output<f64>) {
+//!         force.set(1.0);
+//!     }
+//!
+//!     fn tardy(&mut self, ctx: &mut Ctx, _: &Input<f64>, _: &mut Watchdog, force: &mut Output<f64>) {
+//!         log!(ctx, "due at {}, handled at {}", ctx.intended(), ctx.tag());
+//!         force.set(1.0);
+//!     }
+//!
+//!     #[watchdog(silence)]
+//!     fn silent(&mut self, alarm: &mut PhysicalAction<()>) {
+//!         alarm.schedule(());
+//!     }
+//!
+//!     #[reaction]
+//!     fn alarm(&mut self, _alarm: &PhysicalAction<()>, force: &mut Output<f64>) {
+//!         force.set(1.0);
+//!     }
+//! }
+//! # fn main() {}
+//! ```
+//!
 //! # What does not compile
 //!
 //! An output that the signature does not name:
@@ -229,6 +282,55 @@
 //! #[derive(Clone, Value)]
 //! #[value(native)]
 //! struct Named { name: String }
+//! # fn main() {}
+//! ```
+
+//!
+//! An output in the handler of a watchdog, which runs at no tag:
+//!
+//! ```compile_fail
+//! # use ictus::prelude::*;
+//! #[reactor]
+//! struct Guarded {
+//!     #[watchdog(timeout = 1.ms())]
+//!     guard: Watchdog,
+//!     out: Output<u32>,
+//! }
+//!
+//! #[reactions]
+//! impl Guarded {
+//!     #[watchdog(guard)]
+//!     fn silent(&mut self, out: &mut Output<u32>) {}
+//! }
+//! # fn main() {}
+//! ```
+//!
+//! An STP handler with other arguments than its reaction; a policy for events that are never too soon:
+//!
+//! ```compile_fail
+//! # use ictus::prelude::*;
+//! # #[reactor]
+//! # struct Sink { input: Input<u32> }
+//! #[reactions]
+//! impl Sink {
+//!     #[reaction(stp = Self::tardy)]
+//!     fn take(&mut self, input: &Input<u32>) {}
+//!
+//!     fn tardy(&mut self) {}
+//! }
+//! # fn main() {}
+//! ```
+//!
+//! ```compile_fail
+//! # use ictus::prelude::*;
+//! #[reactor]
+//! struct Keyboard {
+//!     #[action(policy = drop)]
+//!     key: PhysicalAction<u8>,
+//! }
+//!
+//! #[reactions]
+//! impl Keyboard {}
 //! # fn main() {}
 //! ```
 

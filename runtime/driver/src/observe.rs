@@ -108,9 +108,7 @@ impl Observer {
         let (intended_time, intended_microstep) = after(origin, intended);
         self.note(
             path,
-            format_args!(
-                "# tardy {time} {microstep} {path} {intended_time} {intended_microstep}"
-            ),
+            format_args!("# tardy {time} {microstep} {path} {intended_time} {intended_microstep}"),
         );
     }
 

@@ -13,6 +13,7 @@ use crate::outside::OutsideEvent;
 use crate::peers::Peers;
 use crate::status::Status;
 use crate::transport::{self, Awaited, Connection, Signals, Waker};
+use ictus_coord::FederateExecutor as _;
 use ictus_coord::auth::Nonce;
 use ictus_coord::federate::{Federate, FederateConfig, FederateEvent, LinkConfig, Outcome, Poll};
 use ictus_coord::measure::LagNews;
@@ -320,6 +321,7 @@ impl Runner<'_> {
             if looks_at_clock || steps % STEPS_PER_LOOK == 0 {
                 now = self.clock.now();
             }
+            self.guard(now);
             if steps % STEPS_PER_LOOK == 0 {
                 self.look(now);
                 // A program that never waits still hears signals.
@@ -370,6 +372,7 @@ impl Runner<'_> {
             while self.pending() > BACKLOG_BYTES {
                 self.wait(now, None)?;
                 let now = self.clock.now();
+                self.guard(now);
                 self.look(now);
                 self.write(now);
             }
@@ -429,7 +432,11 @@ impl Runner<'_> {
             .status
             .enabled()
             .then(|| self.reported_at + PROGRESS_EVERY);
-        let until = until.into_iter().chain(progress).min();
+        let until = until
+            .into_iter()
+            .chain(progress)
+            .chain(self.watchdog())
+            .min();
         let timeout = until.map(|until| until.since(self.clock.now()));
         if self.sleep(wants_write, timeout)? {
             self.take_signals()?;
@@ -454,6 +461,33 @@ impl Runner<'_> {
             transport::wait(rti.chain(peers), waker, signals, timeout)
         };
         signal.map_err(RunError::Io)
+    }
+
+    /// When a watchdog expires; none does once the last tag is completed.
+    #[inline]
+    fn watchdog(&self) -> Option<PhysicalTime> {
+        let due = self.bodies.next_watchdog()?;
+        (!self.federate.timeline().finished()).then_some(due)
+    }
+
+    /// Runs the watchdogs that have expired.
+    #[inline]
+    fn guard(&mut self, now: PhysicalTime) {
+        if self.watchdog().is_some_and(|due| due <= now) {
+            self.fire_watchdogs(now);
+        }
+    }
+
+    #[cold]
+    fn fire_watchdogs(&mut self, now: PhysicalTime) {
+        if self.bodies.fire_watchdogs(now).stop {
+            self.federate.request_stop(now);
+        }
+        if self.bodies.fault().is_some() {
+            self.federate.fail();
+        }
+        // The events that the handlers made.
+        self.look(now);
     }
 
     fn take_signals(&mut self) -> Result<(), RunError> {

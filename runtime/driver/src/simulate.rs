@@ -515,11 +515,11 @@ impl FederateExecutor for Simulated {
         self.bodies.decode(input, payload)
     }
 
-    fn stamped(&mut self, action: ActionId, tag: Tag) {
+    fn note_physical(&mut self, action: ActionId, tag: Tag) {
         self.bodies.note_physical(action, tag);
     }
 
-    fn tardy(&mut self, input: InputId, intended: Tag, actual: Tag) {
+    fn note_tardy(&mut self, input: InputId, intended: Tag, actual: Tag) {
         self.bodies.note_tardy(input, intended, actual);
     }
 }

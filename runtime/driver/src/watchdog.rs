@@ -139,7 +139,10 @@ impl Watchdogs {
 
     /// Mistakes: every watchdog has one handler.
     pub(crate) fn unhandled(&self) -> Vec<WiringError> {
-        let wrong = self.entries.iter().filter(|entry| entry.handlers.len() != 1);
+        let wrong = self
+            .entries
+            .iter()
+            .filter(|entry| entry.handlers.len() != 1);
         wrong
             .map(|entry| WiringError::Watchdog {
                 path: entry.path.clone(),
@@ -149,7 +152,9 @@ impl Watchdogs {
     }
 
     pub(crate) fn handlers_mut(&mut self) -> impl Iterator<Item = &mut WatchdogHandler> {
-        self.entries.iter_mut().flat_map(|entry| &mut entry.handlers)
+        self.entries
+            .iter_mut()
+            .flat_map(|entry| &mut entry.handlers)
     }
 
     /// The path of one, when there is one.
@@ -181,7 +186,9 @@ impl Watchdogs {
         let mut expired: Vec<_> = {
             let expires = self.board.expires.borrow();
             let due = expires.iter().copied().enumerate();
-            due.filter(|(_, at)| *at <= now).map(|(i, at)| (at, i)).collect()
+            due.filter(|(_, at)| *at <= now)
+                .map(|(i, at)| (at, i))
+                .collect()
         };
         expired.sort_unstable();
         for (_, index) in &expired {

@@ -227,7 +227,9 @@ fn items(arguments: &[Argument]) -> Items {
     Items {
         accesses,
         pattern,
-        passed: passed.map(|(i, argument)| self::passed(i, argument)).collect(),
+        passed: passed
+            .map(|(i, argument)| self::passed(i, argument))
+            .collect(),
     }
 }
 

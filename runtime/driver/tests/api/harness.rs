@@ -2,6 +2,7 @@
 
 use ictus::value::digest_of;
 use ictus::{Assembly, AssemblyError, Class, Clock, Counters, Fault, Observation, Value};
+use ictus_coord::FederateExecutor;
 use ictus_coord::plan::{ConnectionPlan, Endpoint, FederatePlan, Plan};
 use ictus_core::{
     Duration, Effects, Executor, LogicalTime, NodeId, PhysicalTime, Progress, Tag, Timeline,

@@ -1,9 +1,9 @@
 //! Events that come too soon: put off, dropped, or giving their value to the one before.
 
 use crate::harness::{START, World, at, d, line, run_tag, take_outside};
+use ictus::Class;
 use ictus::prelude::*;
 use ictus::value::{Digest, Layout};
-use ictus::Class;
 use ictus_core::Timeline;
 use std::sync::{Arc, Mutex};
 

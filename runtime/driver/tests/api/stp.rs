@@ -94,7 +94,7 @@ fn a_tardy_message_runs_the_handler_with_intended_and_actual_tag() {
         let value = bodies.decode(input, &value.to_le_bytes()).unwrap();
         let admission = timeline.admit(input, intended, value);
         if let Admission::Tardy { intended, actual } = admission {
-            bodies.tardy(input, intended, actual);
+            bodies.note_tardy(input, intended, actual);
         }
     }
     run_tag(&mut timeline, bodies, &world.clock);
