@@ -14,15 +14,31 @@ const ARROWS: &[(&str, &[&str])] = &[
     ("ictus-macros", &[]),
     ("ictus-coord", &["ictus-core"]),
     ("ictus-sim", &["ictus-core", "ictus-coord"]),
+    ("ictus-metrics", &["ictus-core"]),
     (
         "ictus",
-        &["ictus-core", "ictus-coord", "ictus-macros", "ictus-sim"],
+        &[
+            "ictus-core",
+            "ictus-coord",
+            "ictus-macros",
+            "ictus-metrics",
+            "ictus-sim",
+        ],
     ),
-    ("ictus-rti", &["ictus-core", "ictus-coord"]),
+    (
+        "ictus-rti",
+        &["ictus-core", "ictus-coord", "ictus-metrics"],
+    ),
     ("ictus-deploy", &["ictus-core", "ictus-coord"]),
     (
         "ictusd",
-        &["ictus-core", "ictus-coord", "ictus-deploy", "ictus-rti"],
+        &[
+            "ictus-core",
+            "ictus-coord",
+            "ictus-deploy",
+            "ictus-metrics",
+            "ictus-rti",
+        ],
     ),
     (
         "ictus-cli",
@@ -30,6 +46,7 @@ const ARROWS: &[(&str, &[&str])] = &[
             "ictus-core",
             "ictus-coord",
             "ictus-deploy",
+            "ictus-metrics",
             "ictus-rti",
             "ictusd",
         ],

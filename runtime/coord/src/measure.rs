@@ -3,6 +3,7 @@
 //! All values are cumulative since the federate's start. Recording is plain arithmetic: no allocation, no lock. Serialized forms
 //! leave out what is empty, so that one part fits a status line.
 
+use crate::report::Pick;
 use ictus_core::{Duration, PhysicalTime, Tag};
 use serde::{Deserialize, Serialize};
 
@@ -204,38 +205,57 @@ impl Measures {
 }
 
 impl Upstream {
-    /// Takes over what a later report of the same federate says; a histogram it leaves out stays.
-    pub fn update(&mut self, later: Self) {
-        self.messages = later.messages;
-        self.bytes = later.bytes;
-        self.stp_violations = later.stp_violations;
-        self.lateness.update(later.lateness);
-        self.slack.update(later.slack);
-        self.arrival.update(later.arrival);
+    pub(crate) const HISTOGRAMS: &[Pick<Self>] = &[
+        |it| &mut it.lateness,
+        |it| &mut it.slack,
+        |it| &mut it.arrival,
+    ];
+
+    /// Takes over what another report of the same federate says. Nothing goes back: the larger count is the later one, and a histogram
+    /// that is left out stays.
+    pub fn update(&mut self, other: Self) {
+        raise(&mut self.messages, other.messages);
+        raise(&mut self.bytes, other.bytes);
+        raise(&mut self.stp_violations, other.stp_violations);
+        self.lateness.update(other.lateness);
+        self.slack.update(other.slack);
+        self.arrival.update(other.arrival);
     }
 }
 
 impl Downstream {
-    /// Takes over what a later report of the same federate says; a histogram it leaves out stays.
-    pub fn update(&mut self, later: Self) {
-        self.messages = later.messages;
-        self.bytes = later.bytes;
-        self.launch_lag.update(later.launch_lag);
+    pub(crate) const HISTOGRAMS: &[Pick<Self>] = &[|it| &mut it.launch_lag];
+
+    /// As [`Upstream::update`].
+    pub fn update(&mut self, other: Self) {
+        raise(&mut self.messages, other.messages);
+        raise(&mut self.bytes, other.bytes);
+        self.launch_lag.update(other.launch_lag);
     }
 }
 
 impl Own {
-    /// Takes over what a later report of the same federate says; a histogram it leaves out stays.
-    pub fn update(&mut self, later: Self) {
-        self.tags_completed = later.tags_completed;
-        self.reactions = later.reactions;
-        self.deadline_misses = later.deadline_misses;
-        self.watchdogs_fired = later.watchdogs_fired;
-        self.fell_behind = later.fell_behind;
-        self.tag_lag.update(later.tag_lag);
-        self.grant_wait.update(later.grant_wait);
-        self.deadline_lateness.update(later.deadline_lateness);
+    pub(crate) const HISTOGRAMS: &[Pick<Self>] = &[
+        |it| &mut it.tag_lag,
+        |it| &mut it.grant_wait,
+        |it| &mut it.deadline_lateness,
+    ];
+
+    /// As [`Upstream::update`].
+    pub fn update(&mut self, other: Self) {
+        raise(&mut self.tags_completed, other.tags_completed);
+        raise(&mut self.reactions, other.reactions);
+        raise(&mut self.deadline_misses, other.deadline_misses);
+        raise(&mut self.watchdogs_fired, other.watchdogs_fired);
+        raise(&mut self.fell_behind, other.fell_behind);
+        self.tag_lag.update(other.tag_lag);
+        self.grant_wait.update(other.grant_wait);
+        self.deadline_lateness.update(other.deadline_lateness);
     }
+}
+
+fn raise(count: &mut u64, other: u64) {
+    *count = (*count).max(other);
 }
 
 /// The measures of peer `id`; a peer nobody announced gets its place now.

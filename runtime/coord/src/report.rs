@@ -5,8 +5,11 @@ use crate::measure::{Downstream, Own, Upstream};
 use serde::{Deserialize, Serialize};
 
 mod clock;
+mod measures;
 
 pub use clock::{ClockSource, ClockStatus};
+pub(crate) use measures::Pick;
+pub use measures::{FederateMeasures, FederationMeasures, LINE_BYTES_MAX, lines};
 
 /// Exit codes of federate programs and of the RTI.
 pub mod exit {
@@ -70,7 +73,10 @@ pub enum FederateStatus {
     Measures {
         /// The federate's name.
         federate: String,
-        /// Cumulative; histograms that did not fit are left out here and come in a line of their own.
+        /// Which part this is when a report is told in several lines.
+        #[serde(default, skip_serializing_if = "measures::is_whole")]
+        part: u8,
+        /// Cumulative; a histogram that is left out stays as it was.
         own: Own,
     },
     /// What the federate measured of messages from one upstream peer; with `Progress`.
@@ -80,6 +86,9 @@ pub enum FederateStatus {
         /// The peer's federate id.
         upstream: u16,
         /// As in `Measures`.
+        #[serde(default, skip_serializing_if = "measures::is_whole")]
+        part: u8,
+        /// As in `Measures`.
         measures: Upstream,
     },
     /// What the federate measured of messages to one downstream peer; with `Progress`.
@@ -88,6 +97,9 @@ pub enum FederateStatus {
         federate: String,
         /// The peer's federate id.
         downstream: u16,
+        /// As in `Measures`.
+        #[serde(default, skip_serializing_if = "measures::is_whole")]
+        part: u8,
         /// As in `Measures`.
         measures: Downstream,
     },

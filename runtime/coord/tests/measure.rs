@@ -1,7 +1,14 @@
 //! Laws of what is measured.
-#![allow(clippy::unwrap_used, missing_docs, reason = "tests")]
+#![allow(
+    clippy::unwrap_used,
+    clippy::cast_possible_truncation,
+    clippy::cast_sign_loss,
+    missing_docs,
+    reason = "tests"
+)]
 
 use ictus_coord::measure::{Histogram, LagNews, LagWatch, Measures, Upstream};
+use ictus_coord::report::{ClockStatus, FederateMeasures, FederateStatus, LINE_BYTES_MAX, lines};
 use ictus_core::{Duration, LogicalTime, PhysicalTime, Tag};
 use proptest::prelude::*;
 
@@ -136,7 +143,7 @@ fn damaged_histograms_are_refused() {
 }
 
 #[test]
-fn a_later_report_keeps_the_histograms_it_leaves_out() {
+fn a_report_keeps_the_histograms_it_leaves_out() {
     let mut known = Upstream {
         messages: 3,
         slack: histogram(&[1, 2, 3]),
@@ -232,4 +239,194 @@ fn windows_without_a_sample_are_passed_over() {
     }
     assert_eq!(behind_at, Some(6));
     assert!(watch.behind());
+}
+
+/// Something to measure.
+#[derive(Clone, Debug)]
+enum Act {
+    Arrived(u16, i64),
+    Slack(u16, i64),
+    Late(u16, i64),
+    Sent(u16, i64),
+    Own(i64),
+}
+
+fn act() -> impl Strategy<Value = Act> {
+    (0..5, 0_u16..3, span()).prop_map(|(kind, peer, nanos)| match kind {
+        0 => Act::Arrived(peer, nanos),
+        1 => Act::Slack(peer, nanos),
+        2 => Act::Late(peer, nanos),
+        3 => Act::Sent(peer, nanos),
+        _ => Act::Own(nanos),
+    })
+}
+
+fn apply(measures: &mut Measures, act: &Act) {
+    let span = Duration::from_nanos;
+    match *act {
+        Act::Arrived(peer, nanos) => {
+            measures.arrived(peer, 7);
+            measures.arrival(peer, span(nanos));
+        }
+        Act::Slack(peer, nanos) => measures.slack(peer, span(nanos)),
+        Act::Late(peer, nanos) => drop(measures.violation(peer, span(nanos))),
+        Act::Sent(peer, nanos) => {
+            measures.sent(peer, 9);
+            measures.launch_lag(peer, span(nanos));
+        }
+        Act::Own(nanos) => {
+            let tag = Tag {
+                time: LogicalTime::from_nanos(0),
+                microstep: 0,
+            };
+            measures.tag_begun(PhysicalTime::from_nanos(nanos), tag);
+            measures.grant_wait(span(nanos));
+            measures.deadline_missed(span(nanos));
+            measures.tag_completed();
+            measures.reactions(2);
+            measures.watchdog_fired();
+        }
+    }
+}
+
+const NAMES: [&str; 3] = ["a", "b", "c"];
+
+fn take(known: &mut FederateMeasures, line: &[u8]) {
+    let status: FederateStatus = serde_json::from_slice(line).unwrap();
+    known.take(status, |id| NAMES.get(usize::from(id)).copied());
+}
+
+fn assert_equal(known: &FederateMeasures, measures: &Measures) {
+    assert_eq!(known.own, *measures.own());
+    let name = |id: u16| NAMES[usize::from(id)].to_owned();
+    let upstreams: Vec<_> = measures
+        .upstreams()
+        .map(|(id, it)| (name(id), it.clone()))
+        .collect();
+    assert_eq!(
+        known.upstreams.clone().into_iter().collect::<Vec<_>>(),
+        upstreams
+    );
+    let downstreams: Vec<_> = measures
+        .downstreams()
+        .map(|(id, it)| (name(id), it.clone()))
+        .collect();
+    assert_eq!(
+        known.downstreams.clone().into_iter().collect::<Vec<_>>(),
+        downstreams
+    );
+}
+
+proptest! {
+    #[test]
+    fn lines_tell_all_and_taking_one_twice_is_taking_it_once(
+        first in prop::collection::vec(act(), 0..400),
+        then in prop::collection::vec(act(), 0..400),
+    ) {
+        let mut measures = Measures::new(&[0], &[2]);
+        first.iter().for_each(|act| apply(&mut measures, act));
+        let early = lines("x", &measures);
+        let mut known = FederateMeasures::of("x");
+        early.iter().for_each(|line| take(&mut known, line));
+        assert_equal(&known, &measures);
+        then.iter().for_each(|act| apply(&mut measures, act));
+        let late = lines("x", &measures);
+        late.iter().chain(&late).for_each(|line| take(&mut known, line));
+        assert_equal(&known, &measures);
+        // An earlier line that comes again changes nothing.
+        early.iter().for_each(|line| take(&mut known, line));
+        assert_equal(&known, &measures);
+        for line in early.iter().chain(&late) {
+            prop_assert!(line.len() <= LINE_BYTES_MAX, "{}", line.len());
+            prop_assert!(line.ends_with(b"\n") && !line[..line.len() - 1].contains(&b'\n'));
+        }
+    }
+
+    #[test]
+    fn counters_never_go_back(
+        lines in prop::collection::vec((0_u64..9, 0_u64..9, 0_u16..5), 0..20)
+    ) {
+        let mut known = FederateMeasures::of("x");
+        let mut most = 0;
+        for (tags, messages, upstream) in lines {
+            let own = serde_json::json!({
+                "event": "measures", "federate": "x", "own": { "tags_completed": tags }
+            });
+            let peer = serde_json::json!({
+                "event": "upstream", "federate": "x", "upstream": upstream,
+                "measures": { "messages": messages, "later": true }
+            });
+            take(&mut known, own.to_string().as_bytes());
+            take(&mut known, peer.to_string().as_bytes());
+            most = most.max(tags);
+            prop_assert_eq!(known.own.tags_completed, most);
+            prop_assert!(known.upstreams.len() <= NAMES.len(), "peers are the plan's");
+        }
+    }
+}
+
+#[test]
+fn a_report_that_is_too_long_for_a_line_is_told_in_parts() {
+    let mut measures = Measures::new(&[0], &[]);
+    for shift in 4..50 {
+        for sub in 8..16 {
+            for _ in 0..11 {
+                let span = Duration::from_nanos(sub << shift);
+                measures.slack(0, span);
+                measures.arrival(0, span);
+                measures.violation(0, span);
+            }
+        }
+    }
+    let lines = lines("x", &measures);
+    let parts: Vec<u64> = lines
+        .iter()
+        .map(|line| serde_json::from_slice::<serde_json::Value>(line).unwrap())
+        .filter(|line| line["event"] == "upstream")
+        .map(|line| line["part"].as_u64().unwrap_or(0))
+        .collect();
+    assert_eq!(parts, [0, 1, 2]);
+    let mut known = FederateMeasures::of("x");
+    lines.iter().for_each(|line| take(&mut known, line));
+    assert_equal(&known, &measures);
+}
+
+#[test]
+fn the_clock_and_falling_behind_are_taken_too() {
+    let mut known = FederateMeasures::of("x");
+    let clock = ClockStatus {
+        bound_ns: Some(7),
+        ..ClockStatus::default()
+    };
+    let federate = "x".to_owned();
+    known.take(
+        FederateStatus::Clock {
+            federate: federate.clone(),
+            clock: clock.clone(),
+        },
+        |_| None,
+    );
+    assert_eq!(known.clock, Some(clock));
+    known.take(
+        FederateStatus::FallingBehind {
+            federate: federate.clone(),
+            lag_ns: 1,
+        },
+        |_| None,
+    );
+    assert!(known.behind);
+    known.take(
+        FederateStatus::CaughtUp {
+            federate,
+            lag_ns: 1,
+        },
+        |_| None,
+    );
+    assert!(!known.behind);
+    // A clock of another version is one as far as it is known.
+    take(
+        &mut known,
+        br#"{"event":"clock","federate":"x","clock":{"offset_ns":5,"new":1}}"#,
+    );
+    assert_eq!(known.clock.unwrap().offset_ns, 5);
 }

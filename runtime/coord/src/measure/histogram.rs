@@ -1,7 +1,7 @@
 //! Durations counted in buckets whose width grows with the value.
 
 use ictus_core::Duration;
-use serde::{Deserialize, Serialize};
+use serde::{Deserialize, Serialize, Serializer};
 use thiserror::Error;
 
 /// log2 of the sub-buckets per power of two.
@@ -16,8 +16,8 @@ const BUCKETS: usize = (63 - SUB_BITS as usize + 1) * SUBS;
 /// Count, sum and maximum are exact (the sum saturates). A negative duration counts as 0.
 /// Laws: a quantile is at most 1/8 above the exact one and never below it; `merge` equals recording both sequences;
 /// the serialized form reads back as the same histogram.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(try_from = "Sparse", into = "Sparse")]
+#[derive(Clone, Debug, PartialEq, Eq, Deserialize)]
+#[serde(try_from = "Sparse")]
 pub struct Histogram {
     counts: Box<[u64]>,
     count: u64,
@@ -83,10 +83,10 @@ impl Histogram {
         self.max = self.max.max(other.max);
     }
 
-    /// Becomes `later`, a later state of the same histogram, unless that is empty.
-    pub(super) fn update(&mut self, later: Self) {
-        if !later.is_empty() {
-            *self = later;
+    /// Becomes `other`, another state of the same histogram, if that is not an earlier one.
+    pub(super) fn update(&mut self, other: Self) {
+        if other.count >= self.count {
+            *self = other;
         }
     }
 
@@ -170,8 +170,14 @@ fn duration(nanos: u64) -> Duration {
     Duration::from_nanos(i64::try_from(nanos).unwrap_or(i64::MAX))
 }
 
-impl From<Histogram> for Sparse {
-    fn from(histogram: Histogram) -> Self {
+impl Serialize for Histogram {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        Sparse::from(self).serialize(serializer)
+    }
+}
+
+impl From<&Histogram> for Sparse {
+    fn from(histogram: &Histogram) -> Self {
         let mut buckets = Vec::new();
         let mut gap = 0;
         for count in &histogram.counts {
