@@ -9,7 +9,9 @@ use std::time::Duration;
 
 use ictus_deploy::{FederateKind, Settings};
 
-use crate::api::{Event, Failure, FailureKind, MemberView, Outcome, StartRequest, State};
+use crate::api::{
+    Event, ExitReason, Failure, FailureKind, FederateMeasures, MemberView, Outcome, StartRequest, State,
+};
 use crate::supervisor::exit::{Ending, ExitRecord};
 use crate::supervisor::protocol::StopSignal;
 
@@ -26,6 +28,8 @@ pub const RTI: &str = ictus_deploy::COORDINATOR;
 const FIRST_TAG_MAX: Duration = Duration::from_secs(60);
 /// Refused connections that are told: who floods the RTI's port must not flood who watches.
 const REJECTED_MAX: u32 = 20;
+/// Events of a federate's own making that are told, for the same reason.
+const REMARKS_MAX: u32 = 100;
 /// How long after SIGTERM SIGKILL follows, and after SIGKILL the end is declared.
 const KILL_GRACE: Duration = Duration::from_secs(2);
 
@@ -372,6 +376,13 @@ impl Agent {
         self.rti.view()
     }
 
+    /// What the federates measured.
+    #[must_use]
+    pub fn measures(&self) -> Vec<FederateMeasures> {
+        let federates = self.federates.iter();
+        federates.map(|member| member.measures.clone()).collect()
+    }
+
     /// How the federates are.
     #[must_use]
     pub fn federate_views(&self) -> Vec<MemberView> {
@@ -404,8 +415,17 @@ impl Agent {
         if self.member(id).signalled == Some(StopSignal::Kill) && !record.ending.success() {
             self.killed.insert(id);
         }
+        if let MemberId::Federate(index) = id {
+            // Told before, unless nobody was there to hear it.
+            for line in &record.reports {
+                if let Ok(status) = serde_json::from_value(line.clone()) {
+                    self.measure(index, &status);
+                }
+            }
+        }
         let member = self.member_mut(id);
         member.process = Process::Ended;
+        member.view.exit = Some(ExitReason::of(&record.ending));
         member.pid = record.pid;
         let how = record.ending.describe();
         member.view.ending = Some(how.clone());
@@ -458,6 +478,7 @@ impl Agent {
         match member.process {
             Process::Launching | Process::Up => {
                 member.process = Process::Gone;
+                member.view.exit = Some(ExitReason::Unknown);
                 let how = Ending::Unknown.describe();
                 member.view.ending = Some(how.clone());
                 let name = member.name.clone();

@@ -7,17 +7,24 @@
 //! | `POST /v1/federations/NAME` with a [`StartRequest`] | a stream of [`Happening`], one a line, until the federation ends; closing it before `healthy` undoes the start |
 //! | `POST /v1/federations/NAME/stop?kill=BOOL` | the same stream until the end |
 //! | `DELETE /v1/federations/NAME?purge=BOOL` | [`Removed`], when nothing runs any more |
+//! | `GET /v1/federations/NAME/measures` | [`FederationMeasures`], until it is taken down |
 //! | `GET /v1/federations/NAME/logs?follow=BOOL&federate=A,B&tail=N` | a stream of [`LogLine`] |
 //! | `GET /v1/events?follow=BOOL&federation=NAME` | a stream of [`Happening`] |
+//! | `GET /metrics` | all federations as Prometheus reads it; with `metrics.listen` also over TCP, with `GET /healthz` |
 //! | `POST /v1/end` | ends the daemon if it owns nothing |
 //!
 //! Errors are [`ApiError`] with a status of 400 and up.
 
+use std::net::SocketAddr;
 use std::path::PathBuf;
 
 use ictus_coord::plan::Plan;
+use ictus_coord::report::exit;
+pub use ictus_coord::report::{FederateMeasures, FederationMeasures};
 use ictus_deploy::{FederateRun, Settings, TimingSpec};
 use serde::{Deserialize, Serialize};
+
+use crate::supervisor::exit::Ending;
 
 /// The version in every path.
 pub const VERSION: &str = "v1";
@@ -72,6 +79,9 @@ pub struct FederationView {
     pub directory: PathBuf,
     /// The RTI's port once it listens.
     pub rti_port: Option<u16>,
+    /// Where metrics are served over TCP, if they are.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub metrics: Option<SocketAddr>,
     /// The start tag once it is agreed.
     pub start_ns: Option<i64>,
     /// The RTI.
@@ -101,7 +111,7 @@ pub enum State {
 pub struct MemberView {
     /// `rti`, or the federate's name.
     pub name: String,
-    /// `waiting`, `launching`, `up`, `joined`, `running`, `ended`, `foreign`.
+    /// One of [`MemberView::STATES`].
     pub state: String,
     /// Its process id once it was started.
     pub pid: Option<u32>,
@@ -115,6 +125,84 @@ pub struct MemberView {
     pub deadlines_missed: Option<u64>,
     /// How it ended, in words.
     pub ending: Option<String>,
+    /// How it ended, for programs.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub exit: Option<ExitReason>,
+}
+
+impl MemberView {
+    /// Every state, in the order in which a member comes to it.
+    pub const STATES: [&str; 7] = [
+        "waiting",
+        "launching",
+        "up",
+        "joined",
+        "running",
+        "ended",
+        "foreign",
+    ];
+
+    /// Whether its process runs.
+    #[must_use]
+    pub fn lives(&self) -> bool {
+        ["up", "joined", "running"].contains(&self.state.as_str())
+    }
+}
+
+/// How a process ended, in a few words.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum ExitReason {
+    /// At its end.
+    Completed,
+    /// With an error of its own.
+    Failed,
+    /// It lost the RTI.
+    RtiLost,
+    /// Another federate failed.
+    PeerFailed,
+    /// It could not join.
+    NotJoined,
+    /// A signal killed it.
+    Killed,
+    /// It was never started.
+    NotStarted,
+    /// It vanished together with its supervisor.
+    Unknown,
+}
+
+impl ExitReason {
+    /// What an ending amounts to.
+    #[must_use]
+    pub fn of(ending: &Ending) -> Self {
+        match ending {
+            Ending::Exited { code } => match u8::try_from(*code) {
+                Ok(exit::OK) => Self::Completed,
+                Ok(exit::RTI_LOST) => Self::RtiLost,
+                Ok(exit::PEER_FAILED) => Self::PeerFailed,
+                Ok(exit::NOT_JOINED) => Self::NotJoined,
+                Ok(_) | Err(_) => Self::Failed,
+            },
+            Ending::Killed { .. } => Self::Killed,
+            Ending::NotStarted { .. } => Self::NotStarted,
+            Ending::Unknown => Self::Unknown,
+        }
+    }
+
+    /// Its name, as in JSON and in metrics.
+    #[must_use]
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Completed => "completed",
+            Self::Failed => "failed",
+            Self::RtiLost => "rti_lost",
+            Self::PeerFailed => "peer_failed",
+            Self::NotJoined => "not_joined",
+            Self::Killed => "killed",
+            Self::NotStarted => "not_started",
+            Self::Unknown => "unknown",
+        }
+    }
 }
 
 /// How a run ended.
@@ -265,6 +353,38 @@ pub enum Event {
         how: String,
         /// Its own last words, if it said why.
         reason: Option<String>,
+    },
+    /// Messages from a federate come after their input has been decided: told of the first, and then of every tenfold.
+    StpViolation {
+        /// The receiver.
+        federate: String,
+        /// The sender.
+        upstream: String,
+        /// By how much this one was late, in nanoseconds.
+        lateness_ns: i64,
+        /// How many from this sender so far.
+        count: u64,
+    },
+    /// A federate's lag keeps growing.
+    FallingBehind {
+        /// Which.
+        federate: String,
+        /// The lag in nanoseconds.
+        lag_ns: i64,
+    },
+    /// A federate's lag is small again.
+    CaughtUp {
+        /// Which.
+        federate: String,
+        /// The lag in nanoseconds.
+        lag_ns: i64,
+    },
+    /// A clock was stepped: that of the federate's host, or the RTI's.
+    ClockStep {
+        /// The federate that noticed.
+        federate: String,
+        /// How far, in nanoseconds; positive when forward.
+        by_ns: i64,
     },
     /// These did not end in time and were sent a signal.
     Signalled {

@@ -20,7 +20,7 @@ use tokio::task::JoinHandle;
 use tokio::time::timeout;
 
 use crate::api::{
-    ApiError, ErrorCode, FederationView, Happening, Info, LogLine, Removed, StartRequest,
+    ApiError, ErrorCode, FederationMeasures, FederationView, Happening, Info, LogLine, Removed, StartRequest,
 };
 use crate::daemon::READY;
 use crate::paths::{Paths, PathsError};
@@ -276,6 +276,25 @@ impl Client {
         query.extend(name.map(|name| ("federation", name)));
         let path = format!("/v1/events?{}", encode(&query));
         self.stream(Method::GET, &path, Bytes::new()).await
+    }
+
+    /// What was measured in a federation that lives, or has ended and was not taken down.
+    ///
+    /// # Errors
+    /// See [`ClientError`].
+    pub async fn measures(&self, name: &str) -> Result<FederationMeasures, ClientError> {
+        let path = path(name, "/measures", &[]);
+        self.answer(Method::GET, &path, Bytes::new()).await
+    }
+
+    /// All federations' metrics, as Prometheus reads them.
+    ///
+    /// # Errors
+    /// See [`ClientError`].
+    pub async fn metrics(&self) -> Result<String, ClientError> {
+        let (response, _connection) = self.send(Method::GET, "/metrics", Bytes::new()).await?;
+        let bytes = whole(response).await?;
+        Ok(String::from_utf8_lossy(&bytes).into_owned())
     }
 
     /// Ends the daemon if it owns nothing, and waits until it has ended; tells whether it owned nothing.

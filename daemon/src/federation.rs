@@ -2,13 +2,16 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::io;
+use std::net::SocketAddr;
 use std::time::Duration;
 
-use tokio::sync::{broadcast, mpsc, watch};
+use tokio::sync::{broadcast, mpsc, oneshot, watch};
 use tokio::time::{Instant, sleep_until};
 
 use crate::agent::{Action, Agent, MemberId, Now, RTI};
-use crate::api::{Event, FederationView, Happening, MemberView, Outcome, StartRequest, State};
+use crate::api::{
+    Event, FederationMeasures, FederationView, Happening, MemberView, Outcome, StartRequest, State,
+};
 use crate::identity::random_id;
 use crate::paths::Paths;
 use crate::stamp;
@@ -50,6 +53,16 @@ pub(crate) struct Handle {
     pub(crate) view: watch::Receiver<FederationView>,
     /// Whether the view is this daemon's own and not an earlier one's.
     pub(crate) probed: watch::Receiver<bool>,
+    asks: mpsc::Sender<oneshot::Sender<FederationMeasures>>,
+}
+
+impl Handle {
+    /// What is measured; absent when the federation has ended meanwhile.
+    pub(crate) async fn measures(&self) -> Option<FederationMeasures> {
+        let (answer, answered) = oneshot::channel();
+        self.asks.send(answer).await.ok()?;
+        answered.await.ok()
+    }
 }
 
 /// Why a federation could not be begun.
@@ -75,6 +88,7 @@ pub(crate) struct Federation {
     heard: mpsc::Receiver<Heard>,
     hear: mpsc::Sender<Heard>,
     commands: mpsc::Receiver<Command>,
+    asks: mpsc::Receiver<oneshot::Sender<FederationMeasures>>,
     view: watch::Sender<FederationView>,
     probed: watch::Sender<bool>,
     told: broadcast::Sender<Happening>,
@@ -95,7 +109,7 @@ impl Federation {
     pub(crate) fn start(
         paths: &Paths,
         name: &str,
-        request: StartRequest,
+        (request, metrics): (StartRequest, Option<SocketAddr>),
         told: broadcast::Sender<Happening>,
     ) -> Result<(Self, Handle), BeginError> {
         let directory = Directory::of(&paths.federations(), name);
@@ -108,6 +122,7 @@ impl Federation {
             manifest: request.manifest.clone(),
             directory: directory.path().to_path_buf(),
             rti_port: None,
+            metrics,
             start_ns: None,
             rti: MemberView::default(),
             federates: Vec::new(),
@@ -168,6 +183,7 @@ impl Federation {
     ) -> (Self, Handle) {
         let (hear, heard) = mpsc::channel(QUEUE_MAX);
         let (command, commands) = mpsc::channel(QUEUE_MAX);
+        let (ask, asks) = mpsc::channel(QUEUE_MAX);
         let (view, seen) = watch::channel(record.view.clone());
         let (probed, first_probe) = watch::channel(false);
         let handle = Handle {
@@ -175,6 +191,7 @@ impl Federation {
             commands: command,
             view: seen,
             probed: first_probe,
+            asks: ask,
         };
         let federation = Self {
             paths,
@@ -186,6 +203,7 @@ impl Federation {
             heard,
             hear,
             commands,
+            asks,
             view,
             probed,
             told,
@@ -224,6 +242,10 @@ impl Federation {
                     self.handle_all();
                 }
                 Some(command) = self.commands.recv() => self.obey(command),
+                Some(answer) = self.asks.recv() => {
+                    // Who asked may be gone.
+                    answer.send(self.measures()).ok();
+                }
                 () = sleep_until(timeout.unwrap_or(self.origin)), if timeout.is_some() => {
                     self.at_ns = stamp::now_ns();
                     self.agent.handle_timeout(now(self.origin));
@@ -395,6 +417,10 @@ impl Federation {
             let states: Vec<_> = states.map(|it| (it.state.clone(), it.pid)).collect();
             (view.state, view.outcome.clone(), states)
         };
+        if view.outcome.is_some() && self.record.view.outcome.is_none() {
+            // Before the record, which says that there is nothing to adopt any more.
+            self.save_measures();
+        }
         let changed = launching || coarse(&view) != coarse(&self.record.view);
         self.record.view = view.clone();
         if changed {
@@ -402,6 +428,19 @@ impl Federation {
         }
         self.view.send_replace(view);
         self.probed.send_replace(true);
+    }
+
+    fn measures(&self) -> FederationMeasures {
+        FederationMeasures {
+            federation: self.record.view.name.clone(),
+            federates: self.agent.measures(),
+        }
+    }
+
+    fn save_measures(&self) {
+        if let Err(error) = self.directory.write_measures(&self.measures()) {
+            tracing::warn!(%error, "the measures were not kept");
+        }
     }
 
     fn save(&self) {

@@ -1,6 +1,7 @@
 //! All federations of this host: which live, which are only on disk.
 
 use std::collections::BTreeMap;
+use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
@@ -9,11 +10,13 @@ use tokio::time::Instant;
 
 use crate::agent::RTI;
 use crate::api::{
-    ApiError, ErrorCode, Failure, FailureKind, FederationView, Happening, MemberView, Outcome,
-    Removed, StartRequest, State,
+    ApiError, ErrorCode, Failure, FailureKind, FederateMeasures, FederationMeasures,
+    FederationView, Happening, MemberView, Outcome, Removed, StartRequest, State,
 };
 use crate::federation::{BeginError, Command, Federation, Handle};
 use crate::paths::Paths;
+use crate::metrics::{self, Snapshot};
+use crate::scrape::Listeners;
 use crate::store::{self, Directory, Record, StoreError};
 use crate::{rescue, stamp};
 
@@ -28,6 +31,8 @@ pub(crate) struct Host(Arc<Inner>);
 struct Inner {
     paths: Paths,
     living: Mutex<BTreeMap<String, Handle>>,
+    /// Where metrics are served over TCP.
+    listeners: Mutex<Listeners>,
     told: broadcast::Sender<Happening>,
     /// When something was last asked or owned.
     active: watch::Sender<Instant>,
@@ -39,6 +44,7 @@ impl Host {
         Self(Arc::new(Inner {
             paths,
             living: Mutex::default(),
+            listeners: Mutex::default(),
             told: broadcast::channel(EVENTS_MAX).0,
             active: watch::channel(Instant::now()).0,
             end: watch::channel(false).0,
@@ -55,7 +61,8 @@ impl Host {
         for name in store::names(&self.0.paths.federations()) {
             let directory = self.directory(&name);
             match recorded(&name, &directory) {
-                Ok(Some(record)) if record.view.outcome.is_none() => {
+                Ok(Some(mut record)) if record.view.outcome.is_none() => {
+                    record.view.metrics = self.listen_again(&name, &directory);
                     let told = self.0.told.clone();
                     match Federation::adopt(&self.0.paths, directory, record, told) {
                         Ok((federation, handle)) => {
@@ -92,8 +99,9 @@ impl Host {
             });
         }
         self.check_driven(name)?;
+        let metrics = self.listen(name, request.settings.metrics_listen)?;
         let told = self.0.told.clone();
-        let (federation, handle) = Federation::start(&self.0.paths, name, request, told)
+        let (federation, handle) = Federation::start(&self.0.paths, name, (request, metrics), told)
             .map_err(|error| begin_error(&error))?;
         self.spawn(name.to_owned(), federation, handle.clone());
         Ok(handle)
@@ -123,6 +131,70 @@ impl Host {
         }
     }
 
+    /// What was measured in a federation that lives or has ended and was not taken down.
+    pub(crate) async fn measures(&self, name: &str) -> Result<FederationMeasures, ApiError> {
+        if let Some(handle) = self.handle(name)
+            && let Some(measures) = handle.measures().await
+        {
+            return Ok(measures);
+        }
+        let view = self.view(name)?;
+        let kept = self.directory(name).read_measures();
+        if !kept.federates.is_empty() {
+            return Ok(kept);
+        }
+        let federates = view.federates.iter();
+        Ok(FederationMeasures {
+            federation: view.name,
+            federates: federates.map(|it| FederateMeasures::of(&it.name)).collect(),
+        })
+    }
+
+    /// All federations as Prometheus reads it.
+    pub(crate) async fn metrics(&self) -> String {
+        let mut snapshots = Vec::new();
+        for name in self.names() {
+            // Taken down, maybe meanwhile.
+            let (Ok(measures), Ok(view)) = (self.measures(&name).await, self.view(&name)) else {
+                continue;
+            };
+            let plan = self.handle(&name).map(|handle| handle.request.plan);
+            snapshots.push(Snapshot {
+                view,
+                measures,
+                plan,
+            });
+        }
+        metrics::page(&snapshots)
+    }
+
+    /// Listens where a new run wants its metrics to be served, and no longer where the last one did.
+    fn listen(
+        &self,
+        name: &str,
+        wanted: Option<SocketAddr>,
+    ) -> Result<Option<SocketAddr>, ApiError> {
+        let Some(wanted) = wanted else {
+            self.listeners().release(name);
+            return Ok(None);
+        };
+        let claimed = self.listeners().claim(self, name, wanted);
+        claimed.map(Some).map_err(|error| ApiError {
+            code: ErrorCode::Failed,
+            message: format!("cannot serve metrics at {wanted}: {error}"),
+            known: Vec::new(),
+        })
+    }
+
+    /// The same for a run that is taken over: it goes on without, if need be.
+    fn listen_again(&self, name: &str, directory: &Directory) -> Option<SocketAddr> {
+        let wanted = directory.read_request().ok()?.settings.metrics_listen;
+        self.listen(name, wanted).unwrap_or_else(|error| {
+            tracing::warn!(%name, error = error.message, "no metrics over TCP");
+            None
+        })
+    }
+
     /// Every federation that lives or has ended and was not taken down.
     pub(crate) fn views(&self) -> Vec<FederationView> {
         self.names()
@@ -148,6 +220,7 @@ impl Host {
             outcome = handle.view.borrow().outcome.clone();
         }
         self.check_driven(name)?;
+        self.listeners().release(name);
         let kept = self
             .directory(name)
             .remove(purge)
@@ -269,6 +342,11 @@ impl Host {
         }
     }
 
+    fn listeners(&self) -> MutexGuard<'_, Listeners> {
+        let listeners = self.0.listeners.lock();
+        listeners.unwrap_or_else(PoisonError::into_inner)
+    }
+
     fn living(&self) -> MutexGuard<'_, BTreeMap<String, Handle>> {
         // The map is consistent after every operation on it.
         self.0.living.lock().unwrap_or_else(PoisonError::into_inner)
@@ -297,6 +375,7 @@ fn unreadable_view(name: &str, directory: &Directory, error: &StoreError) -> Fed
         manifest: PathBuf::new(),
         directory: directory.path().to_path_buf(),
         rti_port: None,
+        metrics: None,
         start_ns: None,
         rti: MemberView::default(),
         federates: Vec::new(),

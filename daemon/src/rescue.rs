@@ -41,6 +41,7 @@ pub(crate) fn record(name: &str, directory: &Directory) -> Option<Record> {
         manifest: request.manifest,
         directory: directory.path().to_path_buf(),
         rti_port: None,
+        metrics: None,
         start_ns: None,
         rti: MemberView::default(),
         federates: Vec::new(),
@@ -66,6 +67,10 @@ pub(crate) fn record(name: &str, directory: &Directory) -> Option<Record> {
             | Event::Resigned { .. }
             | Event::Lost { .. }
             | Event::Exited { .. }
+            | Event::StpViolation { .. }
+            | Event::FallingBehind { .. }
+            | Event::CaughtUp { .. }
+            | Event::ClockStep { .. }
             | Event::Signalled { .. }
             | Event::Foreign { .. } => {}
         }

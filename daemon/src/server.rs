@@ -20,8 +20,8 @@ use tokio::net::{UnixListener, UnixStream};
 use tokio::sync::{broadcast, mpsc};
 
 use crate::api::{
-    ApiError, ErrorCode, Event, FederationView, Happening, Info, LogLine, Removed, StartRequest,
-    VERSION,
+    ApiError, ErrorCode, Event, FederationMeasures, FederationView, Happening, Info, LogLine,
+    Removed, StartRequest, VERSION,
 };
 use crate::federation::Command;
 use crate::host::Host;
@@ -48,8 +48,10 @@ pub(crate) fn router(host: Host) -> Router {
         .route("/v1/federations/{name}", federation)
         .route("/v1/federations/{name}/stop", post(stop))
         .route("/v1/federations/{name}/logs", get(logs))
+        .route("/v1/federations/{name}/measures", get(measures))
         .route("/v1/events", get(events))
         .route("/v1/end", post(end))
+        .route("/metrics", get(metrics))
         .fallback(async || bad_request("no such call; is the daemon of another version?"))
         .layer(from_fn_with_state(host.clone(), touch))
         .layer(DefaultBodyLimit::max(REQUEST_BYTES_MAX))
@@ -109,6 +111,18 @@ async fn federation(
     Path(name): Path<String>,
 ) -> Result<Json<FederationView>, ApiError> {
     host.view(&name).map(Json)
+}
+
+async fn measures(
+    State(host): State<Host>,
+    Path(name): Path<String>,
+) -> Result<Json<FederationMeasures>, ApiError> {
+    host.measures(&name).await.map(Json)
+}
+
+async fn metrics(State(host): State<Host>) -> Response {
+    let page = host.metrics().await;
+    ([(CONTENT_TYPE, ictus_metrics::CONTENT_TYPE)], page).into_response()
 }
 
 async fn start(

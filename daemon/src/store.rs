@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
-use crate::api::{FederationView, Happening, StartRequest};
+use crate::api::{FederationMeasures, FederationView, Happening, StartRequest};
 use crate::files;
 use crate::identity::ProcessIdentity;
 use crate::supervisor::spec::PROTOCOL;
@@ -157,6 +157,10 @@ impl Directory {
         self.0.join("request.json")
     }
 
+    fn measures(&self) -> PathBuf {
+        self.0.join("measures.json")
+    }
+
     fn record(&self) -> PathBuf {
         self.0.join("record.json")
     }
@@ -221,6 +225,20 @@ impl Directory {
         write(&self.record(), record)
     }
 
+    /// Writes what was measured, at the end of a run.
+    ///
+    /// # Errors
+    /// When the disk does not take it.
+    pub fn write_measures(&self, measures: &FederationMeasures) -> Result<(), StoreError> {
+        write(&self.measures(), measures)
+    }
+
+    /// What was measured in a run that has ended; nothing when that was not kept.
+    #[must_use]
+    pub fn read_measures(&self) -> FederationMeasures {
+        read(&self.measures()).unwrap_or_default()
+    }
+
     /// Keeps an event.
     ///
     /// # Errors
@@ -258,7 +276,12 @@ impl Directory {
             files::remove(&self.0).map_err(io_at(&self.0))?;
             return Ok(Vec::new());
         }
-        for path in [self.request(), self.record(), self.specs()] {
+        for path in [
+            self.request(),
+            self.record(),
+            self.measures(),
+            self.specs(),
+        ] {
             files::remove(&path).map_err(io_at(&path))?;
         }
         let mut kept = Vec::new();
@@ -280,6 +303,7 @@ impl Directory {
             self.plan(),
             self.timing_spec(),
             self.request(),
+            self.measures(),
             self.specs(),
             self.trace(),
             self.timing(),

@@ -22,6 +22,7 @@ use crate::{files, stamp};
 
 mod control;
 pub mod exit;
+mod history;
 mod lines;
 pub(crate) mod log;
 pub(crate) mod process;
@@ -31,6 +32,7 @@ pub mod spec;
 
 use control::{Client, Closed};
 use exit::{Ending, ExitRecord};
+use history::History;
 use lines::Lines;
 use log::{Log, Stream};
 use process::Process;
@@ -42,8 +44,6 @@ pub const READY: &str = "ready";
 
 /// The longest status line; longer ones are no status.
 const STATUS_BYTES_MAX: usize = 64 * 1024;
-/// Status lines kept for later subscribers, `progress` lines apart: of those only the last is kept.
-const STATUSES_MAX: usize = 4096;
 /// Connections at a time; further ones are closed at once.
 const CLIENTS_MAX: usize = 32;
 /// How long pipes that something still holds open are read after the process has ended.
@@ -114,16 +114,6 @@ enum Phase {
     },
     /// The record is written; somebody may want to read it.
     Lingering { until: Instant },
-}
-
-/// What a later subscriber is told first.
-#[derive(Default)]
-struct History {
-    started: Option<Reply>,
-    statuses: Vec<Reply>,
-    progress: Option<Reply>,
-    ended: Option<Reply>,
-    last: Option<serde_json::Value>,
 }
 
 /// What `poll` watches.
@@ -393,6 +383,7 @@ impl Supervisor {
             ended_ns,
             ending,
             last_status: self.history.last.clone(),
+            reports: self.history.reports(),
             first_lines: self.log.first_lines().to_vec(),
             log_lines_lost: self.log.lost(),
         };
@@ -462,25 +453,6 @@ impl Supervisor {
         self.process
             .as_ref()
             .filter(|_| matches!(self.phase, Phase::Running))
-    }
-}
-
-impl History {
-    fn report(&mut self, at_ns: i64, line: serde_json::Value) -> Reply {
-        self.last = Some(line.clone());
-        let progress = line.get("event").is_some_and(|event| event == "progress");
-        let reply = Reply::Reported { at_ns, line };
-        if progress {
-            self.progress = Some(reply.clone());
-        } else if self.statuses.len() < STATUSES_MAX {
-            self.statuses.push(reply.clone());
-        }
-        reply
-    }
-
-    fn all(&self) -> impl Iterator<Item = &Reply> {
-        let first = self.started.iter().chain(&self.statuses);
-        first.chain(&self.progress).chain(&self.ended)
     }
 }
 

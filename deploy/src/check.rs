@@ -1,6 +1,7 @@
 //! The one entry: a manifest's path in, a checked federation or every mistake out.
 
 use std::collections::BTreeMap;
+use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
@@ -143,10 +144,13 @@ pub struct Settings {
     pub log_max_files: u32,
     /// Whether clocks are compared with the RTI's before the start.
     pub clock: ClockSync,
+    /// Where the daemon serves metrics over TCP; absent: nowhere.
+    #[serde(default)]
+    pub metrics_listen: Option<SocketAddr>,
 }
 
 impl Default for Settings {
-    /// Any port, 30 s to join, 5 s to stop, three logs of 10 MiB, no clock exchanges.
+    /// Any port, 30 s to join, 5 s to stop, three logs of 10 MiB, no clock exchanges, no metrics over TCP.
     fn default() -> Self {
         Self {
             rti_port: None,
@@ -155,6 +159,7 @@ impl Default for Settings {
             log_max_size: 10 << 20,
             log_max_files: 3,
             clock: ClockSync::Off,
+            metrics_listen: None,
         }
     }
 }
@@ -434,6 +439,7 @@ fn settings(manifest: &Manifest) -> Settings {
             .map_or(basic.log_max_size, |size| size.0),
         log_max_files: defaults.logs.max_files.unwrap_or(basic.log_max_files),
         clock: manifest.clock.sync,
+        metrics_listen: None,
     }
 }
 

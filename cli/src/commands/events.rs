@@ -89,6 +89,30 @@ pub(crate) fn describe(event: &Event) -> String {
         } => {
             format!("{member} ended: {how} ({})", one_line(reason))
         }
+        Event::StpViolation {
+            federate,
+            upstream,
+            lateness_ns,
+            count,
+        } => format!(
+            "{federate} got a message from {upstream} {} late ({count} so far)",
+            nanoseconds(*lateness_ns)
+        ),
+        Event::FallingBehind { federate, lag_ns } => {
+            format!(
+                "{federate} falls behind: its lag is {} and grows",
+                nanoseconds(*lag_ns)
+            )
+        }
+        Event::CaughtUp { federate, lag_ns } => {
+            format!(
+                "{federate} has caught up: its lag is {}",
+                nanoseconds(*lag_ns)
+            )
+        }
+        Event::ClockStep { federate, by_ns } => {
+            format!("{federate} noticed a clock step of {}", nanoseconds(*by_ns))
+        }
         Event::Signalled { signal, members } => {
             format!(
                 "did not end in time and got {signal}: {}",

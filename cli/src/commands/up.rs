@@ -362,6 +362,10 @@ impl Stages {
             | Event::Resigned { .. }
             | Event::Lost { .. }
             | Event::Exited { .. }
+            | Event::StpViolation { .. }
+            | Event::FallingBehind { .. }
+            | Event::CaughtUp { .. }
+            | Event::ClockStep { .. }
             | Event::Signalled { .. }
             | Event::Foreign { .. } => ui.stage("", &describe(event)),
         }

@@ -1,5 +1,7 @@
 //! A process of the federation, as far as the agent knows it.
 
+use ictus_coord::report::FederateMeasures;
+
 use crate::api::MemberView;
 use crate::supervisor::protocol::StopSignal;
 
@@ -16,6 +18,9 @@ pub(super) struct Member {
     pub(super) view: MemberView,
     pub(super) reason: Option<String>,
     pub(super) signalled: Option<StopSignal>,
+    pub(super) measures: FederateMeasures,
+    /// Events told that its own words caused, over and over.
+    pub(super) remarks: u32,
 }
 
 /// Where a member's process stands.
@@ -49,6 +54,8 @@ impl Member {
             },
             reason: None,
             signalled: None,
+            measures: FederateMeasures::of(name),
+            remarks: 0,
         }
     }
 

@@ -2,7 +2,7 @@
 
 use ictus_coord::report::{FederateStatus, RtiStatus};
 
-use super::{Agent, FIRST_TAG_MAX, MemberId, Now, Phase, REJECTED_MAX, RTI, Why};
+use super::{Agent, FIRST_TAG_MAX, MemberId, Now, Phase, REJECTED_MAX, REMARKS_MAX, RTI, Why};
 use crate::api::Event;
 
 impl Agent {
@@ -16,6 +16,7 @@ impl Agent {
             }
             MemberId::Federate(index) => {
                 if let Ok(status) = serde_json::from_value(line.clone()) {
+                    self.measure(index, &status);
                     self.handle_federate_status(usize::from(index), status);
                 }
             }
@@ -102,6 +103,36 @@ impl Agent {
         }
     }
 
+    /// Takes what a line says of a federate's measures; lines of another shape say nothing.
+    pub(super) fn measure(&mut self, index: u16, status: &FederateStatus) {
+        let index = usize::from(index);
+        let Some(member) = self.federates.get_mut(index) else {
+            return;
+        };
+        let mut measures = std::mem::take(&mut member.measures);
+        let name = |id: u16| {
+            let member = self.federates.get(usize::from(id));
+            member.map(|member| member.name.as_str())
+        };
+        measures.take(status.clone(), name);
+        if let Some(member) = self.federates.get_mut(index) {
+            member.measures = measures;
+        }
+    }
+
+    /// Tells what a federate says of itself, but not without end.
+    fn remark(&mut self, index: usize, event: impl FnOnce(&Self, String) -> Event) {
+        let Some(member) = self.federates.get_mut(index) else {
+            return;
+        };
+        member.remarks += 1;
+        if member.remarks <= REMARKS_MAX {
+            let name = member.name.clone();
+            let event = event(self, name);
+            self.tell(event);
+        }
+    }
+
     pub(super) fn handle_federate_status(&mut self, index: usize, status: FederateStatus) {
         let Some(member) = self.federates.get_mut(index) else {
             return;
@@ -109,14 +140,31 @@ impl Agent {
         match status {
             // The RTI says these, for foreign federates as well.
             FederateStatus::Joined { .. } | FederateStatus::Start { .. } => {}
+            // Measured, not told.
             FederateStatus::Measures { .. }
             | FederateStatus::Upstream { .. }
             | FederateStatus::Downstream { .. }
-            | FederateStatus::Clock { .. }
-            | FederateStatus::StpViolation { .. }
-            | FederateStatus::FallingBehind { .. }
-            | FederateStatus::CaughtUp { .. }
-            | FederateStatus::ClockStep { .. } => {}
+            | FederateStatus::Clock { .. } => {}
+            FederateStatus::StpViolation {
+                upstream,
+                lateness_ns,
+                count,
+                ..
+            } => self.remark(index, |agent, federate| Event::StpViolation {
+                federate,
+                upstream: agent.name(upstream),
+                lateness_ns,
+                count,
+            }),
+            FederateStatus::FallingBehind { lag_ns, .. } => {
+                self.remark(index, |_, federate| Event::FallingBehind { federate, lag_ns });
+            }
+            FederateStatus::CaughtUp { lag_ns, .. } => {
+                self.remark(index, |_, federate| Event::CaughtUp { federate, lag_ns });
+            }
+            FederateStatus::ClockStep { by_ns, .. } => {
+                self.remark(index, |_, federate| Event::ClockStep { federate, by_ns });
+            }
             FederateStatus::Running { .. } => {
                 member.running = true;
                 let federate = member.name.clone();

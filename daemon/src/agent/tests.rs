@@ -116,6 +116,7 @@ impl World {
             ended_ns: self.now.wall_ns,
             ending,
             last_status: None,
+            reports: Vec::new(),
             first_lines: vec!["first words".to_owned()],
             log_lines_lost: 0,
         };

@@ -30,6 +30,9 @@ pub struct ExitRecord {
     pub ending: Ending,
     /// The last line it wrote to its status pipe.
     pub last_status: Option<serde_json::Value>,
+    /// The last line of each kind that a later one replaces: progress, measures, the clock.
+    #[serde(default)]
+    pub reports: Vec<serde_json::Value>,
     /// The first lines it wrote to standard error, or to standard output when there were none.
     pub first_lines: Vec<String>,
     /// Log lines that could not be written to disk.
