@@ -10,7 +10,8 @@ use std::time::Duration;
 use ictus_deploy::{FederateKind, Settings};
 
 use crate::api::{
-    Event, ExitReason, Failure, FailureKind, FederateMeasures, MemberView, Outcome, StartRequest, State,
+    Event, ExitReason, Failure, FailureKind, FederateMeasures, MemberView, Outcome, StartRequest,
+    State,
 };
 use crate::supervisor::exit::{Ending, ExitRecord};
 use crate::supervisor::protocol::StopSignal;

@@ -20,7 +20,8 @@ use tokio::task::JoinHandle;
 use tokio::time::timeout;
 
 use crate::api::{
-    ApiError, ErrorCode, FederationMeasures, FederationView, Happening, Info, LogLine, Removed, StartRequest,
+    ApiError, ErrorCode, FederationMeasures, FederationView, Happening, Info, LogLine, Removed,
+    StartRequest,
 };
 use crate::daemon::READY;
 use crate::paths::{Paths, PathsError};

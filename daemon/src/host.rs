@@ -14,8 +14,8 @@ use crate::api::{
     FederationView, Happening, MemberView, Outcome, Removed, StartRequest, State,
 };
 use crate::federation::{BeginError, Command, Federation, Handle};
-use crate::paths::Paths;
 use crate::metrics::{self, Snapshot};
+use crate::paths::Paths;
 use crate::scrape::Listeners;
 use crate::store::{self, Directory, Record, StoreError};
 use crate::{rescue, stamp};

@@ -157,5 +157,15 @@ fn observed(registry: &mut Registry, metric: Metric, labels: &[&str], histogram:
     }
 }
 
+/// The page of these measures alone.
+#[cfg(test)]
+pub(crate) fn measures_page(measures: &FederationMeasures) -> String {
+    let mut registry = Registry::default();
+    for federate in &measures.federates {
+        measured(&mut registry, &measures.federation, federate);
+    }
+    registry.text()
+}
+
 #[cfg(test)]
 mod tests;

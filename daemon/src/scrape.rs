@@ -136,16 +136,22 @@ async fn converse(stream: TcpStream, host: Host) {
 async fn answer(request: &Request<Incoming>, host: &Host) -> Response<Full<Bytes>> {
     let reading = [Method::GET, Method::HEAD].contains(request.method());
     let (status, kind, text) = match request.uri().path() {
-        "/metrics" | "/healthz" if !reading => {
-            (StatusCode::METHOD_NOT_ALLOWED, PLAIN, "read only\n".to_owned())
-        }
+        "/metrics" | "/healthz" if !reading => (
+            StatusCode::METHOD_NOT_ALLOWED,
+            PLAIN,
+            "read only\n".to_owned(),
+        ),
         "/metrics" => (
             StatusCode::OK,
             ictus_metrics::CONTENT_TYPE,
             host.metrics().await,
         ),
         "/healthz" => (StatusCode::OK, PLAIN, "ok\n".to_owned()),
-        _ => (StatusCode::NOT_FOUND, PLAIN, "there is /metrics and /healthz\n".to_owned()),
+        _ => (
+            StatusCode::NOT_FOUND,
+            PLAIN,
+            "there is /metrics and /healthz\n".to_owned(),
+        ),
     };
     let mut response = Response::new(Full::from(text));
     *response.status_mut() = status;

@@ -276,12 +276,7 @@ impl Directory {
             files::remove(&self.0).map_err(io_at(&self.0))?;
             return Ok(Vec::new());
         }
-        for path in [
-            self.request(),
-            self.record(),
-            self.measures(),
-            self.specs(),
-        ] {
+        for path in [self.request(), self.record(), self.measures(), self.specs()] {
             files::remove(&path).map_err(io_at(&path))?;
         }
         let mut kept = Vec::new();

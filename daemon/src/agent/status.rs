@@ -157,7 +157,10 @@ impl Agent {
                 count,
             }),
             FederateStatus::FallingBehind { lag_ns, .. } => {
-                self.remark(index, |_, federate| Event::FallingBehind { federate, lag_ns });
+                self.remark(index, |_, federate| Event::FallingBehind {
+                    federate,
+                    lag_ns,
+                });
             }
             FederateStatus::CaughtUp { lag_ns, .. } => {
                 self.remark(index, |_, federate| Event::CaughtUp { federate, lag_ns });

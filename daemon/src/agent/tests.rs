@@ -106,26 +106,25 @@ impl World {
         self.on(id, MemberEvent::Reported { line });
     }
 
-    fn ends(&mut self, id: MemberId, ending: Ending) {
-        let record = ExitRecord {
+    fn record(now: Now, ending: Ending) -> ExitRecord {
+        ExitRecord {
             protocol: PROTOCOL,
             instance: String::new(),
             name: String::new(),
             pid: Some(7),
             started_ns: 0,
-            ended_ns: self.now.wall_ns,
+            ended_ns: now.wall_ns,
             ending,
             last_status: None,
             reports: Vec::new(),
             first_lines: vec!["first words".to_owned()],
             log_lines_lost: 0,
-        };
-        self.on(
-            id,
-            MemberEvent::Ended {
-                record: Box::new(record),
-            },
-        );
+        }
+    }
+
+    fn ends(&mut self, id: MemberId, ending: Ending) {
+        let record = Box::new(Self::record(self.now, ending));
+        self.on(id, MemberEvent::Ended { record });
         self.on(id, MemberEvent::Closed);
     }
 
@@ -459,3 +458,6 @@ fn an_adopted_half_start_is_undone() {
     assert_eq!(agent.poll_action(), Some(signal));
     assert_eq!(agent.poll_action(), None);
 }
+
+#[path = "reports.rs"]
+mod reports;

@@ -96,12 +96,17 @@ mod tests {
     fn of_reports_the_last_of_each_kind_is_kept() {
         let mut history = History::default();
         let running = json!({"event": "running", "federate": "a"});
-        let upstream = |peer: u16, n: u32| {
-            json!({"event": "upstream", "federate": "a", "upstream": peer, "measures": {"messages": n}})
-        };
+        let upstream = |peer: u16, n: u32| json!({"event": "upstream", "federate": "a", "upstream": peer, "measures": {"messages": n}});
         let part = json!({"event": "upstream", "federate": "a", "upstream": 1, "part": 1});
         let clock = json!({"event": "clock", "federate": "a", "clock": {}});
-        for line in [&upstream(1, 1), &running, &clock, &upstream(2, 1), &part, &upstream(1, 2)] {
+        for line in [
+            &upstream(1, 1),
+            &running,
+            &clock,
+            &upstream(2, 1),
+            &part,
+            &upstream(1, 2),
+        ] {
             history.report(0, line.clone());
         }
         let reports = [clock, upstream(1, 2), part, upstream(2, 1)];

@@ -19,7 +19,11 @@ use std::process::{Command, ExitCode};
 use std::sync::mpsc::{Sender, channel};
 use std::thread;
 
-use ictus_coord::report::{FederateStatus, RtiStatus, exit};
+use ictus_coord::measure::Measures;
+use ictus_coord::report::{
+    self as status_lines, ClockSource, ClockStatus, FederateStatus, RtiStatus, exit,
+};
+use ictus_core::Duration;
 use ictusd::daemon;
 use ictusd::paths::Paths;
 use ictusd::supervisor;
@@ -226,6 +230,37 @@ fn federate(options: &BTreeMap<String, String>) -> ExitCode {
     }
 }
 
+/// What a federate with one upstream peer says once a second, lines that are none among it.
+fn say_measures(status: &mut Status, federate: &str) {
+    let mut measures = Measures::new(&[0], &[0]);
+    measures.arrived(0, 8);
+    measures.slack(0, Duration::from_millis(3));
+    measures.violation(0, Duration::from_millis(2));
+    measures.sent(0, 16);
+    measures.tag_completed();
+    for line in status_lines::lines(federate, &measures) {
+        status.0.write_all(&line).unwrap();
+    }
+    status.say(&FederateStatus::Clock {
+        federate: federate.to_owned(),
+        clock: ClockStatus {
+            source: ClockSource::Builtin,
+            bound_ns: Some(5_000),
+            ..ClockStatus::default()
+        },
+    });
+    status
+        .0
+        .write_all(b"{\"event\":\"upstream\"}\nnothing\n\xff\n")
+        .unwrap();
+    status.say(&FederateStatus::StpViolation {
+        federate: federate.to_owned(),
+        upstream: 0,
+        lateness_ns: 2_000_000,
+        count: 1,
+    });
+}
+
 fn member(options: &BTreeMap<String, String>, manner: &str) -> ExitCode {
     let mut status = Status::open(options);
     let federate = options["--federate"].clone();
@@ -254,6 +289,9 @@ fn member(options: &BTreeMap<String, String>, manner: &str) -> ExitCode {
                 status.say(&FederateStatus::Running {
                     federate: federate.clone(),
                 });
+                if manner == "measured" {
+                    say_measures(&mut status, &federate);
+                }
                 if manner == "short" {
                     (code, reason) = (exit::OK, "nothing left to do");
                     break;

@@ -8,5 +8,6 @@
 )]
 
 mod daemon;
+mod metrics;
 mod supervisor;
 mod world;
