@@ -10,6 +10,7 @@ mod payload;
 pub mod plan;
 pub mod report;
 pub mod rti;
+pub mod stp;
 pub mod topology;
 pub mod wire;
 
