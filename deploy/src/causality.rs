@@ -9,12 +9,12 @@ use crate::wiring::Wire;
 /// Reports one loop for every group of ports that depend on each other without delay.
 ///
 /// An edge leads from an output to an input over a connection without `after`, and from an input to an output
-/// over a zero-delay dependency inside a federate. A cycle of connections that a federate breaks inside, because
+/// over a zero-delay dependency inside a federate. A physical connection makes no edge: its tag is a later one. A cycle of connections that a federate breaks inside, because
 /// no output of it depends on the input at the same tag, is legal.
 pub(crate) fn check(members: &[Member<'_>], wires: &[Wire], report: &mut Report) {
     let graph = Graph::new(members, wires);
     let mut done: BTreeSet<usize> = graph.orderly();
-    for wire in wires.iter().filter(|wire| wire.plan.after_ns.is_none()) {
+    for wire in wires.iter().filter(immediate) {
         let (Some(&from), Some(&to)) = (graph.id(wire, true), graph.id(wire, false)) else {
             continue;
         };
@@ -36,6 +36,11 @@ pub(crate) fn check(members: &[Member<'_>], wires: &[Wire], report: &mut Report)
         let place = Place::value(&["connections", &wire.entry.to_string(), "from"]);
         report.add("F018", place, message, fix);
     }
+}
+
+/// Whether a connection keeps the tag.
+fn immediate(wire: &&Wire) -> bool {
+    wire.plan.after_ns.is_none() && !wire.plan.physical
 }
 
 /// A port's channel: federate, name, channel.
@@ -60,7 +65,7 @@ impl Graph {
         };
         let mut inputs: BTreeMap<(u16, String), BTreeSet<usize>> = BTreeMap::new();
         let mut outputs: BTreeMap<(u16, String), BTreeSet<usize>> = BTreeMap::new();
-        for wire in wires.iter().filter(|wire| wire.plan.after_ns.is_none()) {
+        for wire in wires.iter().filter(immediate) {
             let (from, to) = (&wire.plan.from, &wire.plan.to);
             let source = graph.node((from.federate, from.port.clone(), from.channel));
             let target = graph.node((to.federate, to.port.clone(), to.channel));
@@ -200,7 +205,7 @@ mod tests {
         }
     }
 
-    fn wire(from: usize, to: usize, after_ns: Option<i64>, entry: usize) -> Wire {
+    fn wire((from, to, after_ns, physical): Edge, entry: usize) -> Wire {
         let end = |federate: usize, port: &str| Endpoint {
             federate: u16::try_from(federate).unwrap(),
             port: port.to_owned(),
@@ -216,10 +221,14 @@ mod tests {
                 after_ns,
                 serializer,
                 port_id: 0,
+                physical,
                 ..ConnectionPlan::default()
             },
         }
     }
+
+    /// Sender, receiver, `after`, whether physical.
+    type Edge = (usize, usize, Option<i64>, bool);
 
     /// Whether any federate can reach itself without delay: over connections without `after`, through
     /// federates that pass an input on at the same tag.
@@ -244,7 +253,10 @@ mod tests {
         #[test]
         fn loops_are_found_and_only_they(
             passes in prop::collection::vec(any::<bool>(), 1..6),
-            pairs in prop::collection::vec((0_usize..6, 0_usize..6, prop::option::of(0_i64..2)), 0..10),
+            pairs in prop::collection::vec(
+                (0_usize..6, 0_usize..6, prop::option::of(0_i64..2), prop::bool::weighted(0.2)),
+                0..10,
+            ),
         ) {
             let count = passes.len();
             let names: Vec<String> = (0..count).map(|index| format!("f{index}")).collect();
@@ -267,17 +279,19 @@ mod tests {
                     }),
                 })
                 .collect();
-            let pairs: Vec<_> =
-                pairs.into_iter().map(|(from, to, after)| (from % count, to % count, after)).collect();
+            let pairs: Vec<Edge> = pairs
+                .into_iter()
+                .map(|(from, to, after, physical)| (from % count, to % count, after, physical))
+                .collect();
             let wires: Vec<Wire> = pairs
                 .iter()
                 .enumerate()
-                .map(|(entry, (from, to, after))| wire(*from, *to, *after, entry))
+                .map(|(entry, edge)| wire(*edge, entry))
                 .collect();
             let immediate: Vec<(usize, usize)> = pairs
                 .iter()
-                .filter(|(_, _, after)| after.is_none())
-                .map(|(from, to, _)| (*from, *to))
+                .filter(|(_, _, after, physical)| after.is_none() && !physical)
+                .map(|(from, to, _, _)| (*from, *to))
                 .collect();
             let mut report = Report::new(Path::new("x.yaml"), "");
             check(&members, &wires, &mut report);

@@ -5,16 +5,16 @@ use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use ictus_coord::plan::{ClockPlan, ClockSync, Coordination, FORMAT, FederatePlan, Plan};
+use ictus_coord::plan::{ClockSync, Plan};
 use serde::{Deserialize, Serialize};
 
 use crate::document::{Node, SyntaxError, Value};
 use crate::federation::{self, Executables, Member, Origin, Workshop};
 use crate::manifest::{self, Manifest, TimeSpan};
+use crate::offsets::Offsets;
 use crate::problem::{Place, Problem, Problems, Report};
 use crate::timing::TimingSpec;
-use crate::wiring::{self, Wire};
-use crate::{causality, lets, reactions, structure};
+use crate::{causality, lets, offsets, plan, policy, reactions, structure, wiring};
 
 /// The longest manifest that is read, in bytes.
 const MAX_MANIFEST: u64 = 1 << 20;
@@ -87,6 +87,9 @@ pub struct Checked {
     /// The resolved plan. After a check without build it is provisional: widths, default serializers and
     /// types are not known, so nothing may be run from it.
     pub plan: Plan,
+    /// The STP offsets with what they are made of; also under centralized coordination, where they play no part,
+    /// as far as they can be solved.
+    pub offsets: Option<Offsets>,
     /// One per federate of the plan, in its order. Empty after a check without build.
     pub federates: Vec<FederateRun>,
     /// What the manifest says about the run itself.
@@ -253,13 +256,15 @@ fn conclude(
     executables: &Executables,
     report: &mut Report,
 ) -> Checked {
-    let wires = wiring::wire(manifest, members, report);
+    let mut wires = wiring::wire(manifest, members, report);
     causality::check(members, &wires, report);
-    check_fast(manifest, members, report);
+    policy::check(manifest, members, report);
+    let offsets = offsets::resolve(manifest, members, &mut wires, report);
     let timing = reactions::resolve(manifest, members, &wires, report);
     Checked {
         manifest: path.to_path_buf(),
-        plan: plan(manifest, members, wires),
+        plan: plan::resolve(manifest, members, (wires, offsets.as_ref())),
+        offsets,
         federates: runs(members, executables),
         settings: settings(manifest),
         timing,
@@ -317,67 +322,6 @@ fn syntax_fix(text: &str, error: &SyntaxError) -> &'static str {
         return "look before this place for a bracket, brace or quote that is not closed";
     }
     ""
-}
-
-fn check_fast(manifest: &Manifest, members: &[Member<'_>], report: &mut Report) {
-    if !manifest.fast {
-        return;
-    }
-    let physical: Vec<&str> = members
-        .iter()
-        .filter(|member| {
-            member
-                .description
-                .as_ref()
-                .is_some_and(|known| known.physical)
-        })
-        .map(|member| member.name)
-        .collect();
-    if !physical.is_empty() {
-        let message = format!(
-            "`fast`, but `{}` has a physical action",
-            physical.join("`, `")
-        );
-        report.add(
-            "F019",
-            Place::value(&["fast"]),
-            message,
-            "remove `fast: true`",
-        );
-    }
-}
-
-fn plan(manifest: &Manifest, members: &[Member<'_>], wires: Vec<Wire>) -> Plan {
-    let federates = members.iter().map(|member| {
-        let (program, class) = match member.origin {
-            Origin::Ours { program, class } => (program, class),
-            Origin::Foreign { .. } => (None, None),
-        };
-        FederatePlan {
-            name: member.name.to_owned(),
-            class: class.map(str::to_owned),
-            program: program.map(str::to_owned),
-            parameters: federation::parameters(member.federate),
-            ..FederatePlan::default()
-        }
-    });
-    Plan {
-        ictus: FORMAT.to_owned(),
-        federation: manifest.federation.clone().unwrap_or_default(),
-        coordination: manifest.coordination.unwrap_or(Coordination::Centralized),
-        timeout_ns: manifest.timeout.map(|span| span.0),
-        fast: manifest.fast,
-        keepalive: manifest.keepalive,
-        max_lead_ns: manifest.max_lead.map(|span| span.0),
-        clock: ClockPlan {
-            sync: manifest.clock.sync,
-            ..ClockPlan::default()
-        },
-        extensions: true,
-        federates: federates.collect(),
-        connections: wires.into_iter().map(|wire| wire.plan).collect(),
-        ..Plan::default()
-    }
 }
 
 fn runs(members: &[Member<'_>], executables: &Executables) -> Vec<FederateRun> {
@@ -439,7 +383,7 @@ fn settings(manifest: &Manifest) -> Settings {
             .map_or(basic.log_max_size, |size| size.0),
         log_max_files: defaults.logs.max_files.unwrap_or(basic.log_max_files),
         clock: manifest.clock.sync,
-        metrics_listen: None,
+        metrics_listen: manifest.metrics.listen.map(|address| address.0),
     }
 }
 

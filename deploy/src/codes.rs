@@ -106,8 +106,9 @@ pub(crate) const CODES: &[(&str, &str)] = &[
     ),
     (
         "F019",
-        "`fast` runs ahead of physical time, but a federate has a physical action, whose events \
-         come at physical times. Remove `fast`, or the physical action.",
+        "`fast` runs ahead of physical time, but something depends on it: a physical action, a \
+         physical connection, or decentralized coordination, under which federates wait by their \
+         clocks. Remove `fast`, or the other.",
     ),
     (
         "F020",
@@ -148,10 +149,44 @@ pub(crate) const CODES: &[(&str, &str)] = &[
          paths are relative to the manifest.",
     ),
     (
+        "F028",
+        "Under decentralized coordination a federate waits an offset for what may still come. It is \
+         declared (`stp_offset: 5 ms`) or solved (`auto`) from three bounds of every connection to \
+         it: `launch_lag`, `latency` and `clock_error`. They stand in `bounds`, for all connections \
+         or under `links` for those between two federates, or at a connection itself; `launch_lag` \
+         also at the sender. `ictus timing --suggest` prints measured ones.",
+    ),
+    (
+        "F029",
+        "Offsets are the least solution of S_j = max(0, S_i + L + N + E - after), and here there is \
+         none. Around a cycle of connections a message becomes later each time, because launch \
+         lags, latencies and clock errors add up to more than the `after` delays; so no federate of \
+         it can wait long enough. Give the cycle more `after`, declare smaller bounds if they hold, \
+         or coordinate centrally.",
+    ),
+    (
         "W001",
         "No connection leads to an input, so its reactions will not run.",
     ),
     ("W002", "Nothing uses this name."),
+    (
+        "W003",
+        "The key does nothing here: offsets belong to decentralized coordination, `max_lead` to \
+         centralized; a physical connection has no tag to be late for; a foreign federate cannot be \
+         told; without clock synchronization no error is measured.",
+    ),
+    (
+        "W004",
+        "The declared offset is smaller than the bounds require, so messages that keep all their \
+         bounds may come too late. That is legal: availability before consistency. Every violation \
+         is counted.",
+    ),
+    (
+        "W005",
+        "The offset of a foreign federate is compiled in. The one shown here is what it needs; \
+         what it has, only its `stp_offset` in the manifest says, and its receivers' offsets are \
+         solved with that.",
+    ),
 ];
 
 #[cfg(test)]

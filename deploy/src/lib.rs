@@ -11,6 +11,9 @@ mod document;
 mod federation;
 mod lets;
 mod manifest;
+pub mod offsets;
+mod plan;
+mod policy;
 pub mod problem;
 mod program;
 mod quantity;
@@ -26,5 +29,6 @@ pub use check::{
 };
 pub use codes::explain;
 pub use manifest::COORDINATOR;
+pub use offsets::Offsets;
 pub use problem::{Problem, Problems};
 pub use timing::TimingSpec;

@@ -1,15 +1,19 @@
 //! The manifest as it is written: the types behind the JSON Schema. Nothing is checked here but form.
 
-use std::fmt;
-use std::marker::PhantomData;
+mod scalar;
+mod words;
 
-use ictus_coord::plan::{ClockSync, Coordination};
+use ictus_coord::plan::{ClockSync, Coordination, OnExceed, OnFailure, Wire};
 use schemars::{JsonSchema, Schema, SchemaGenerator, json_schema};
-use serde::de::{Deserializer, MapAccess, Visitor};
-use serde::{Deserialize, Serialize};
+use serde::Deserialize;
 use serde_json::Value;
 
-use crate::quantity;
+pub(crate) use self::scalar::{
+    Address, ByteSize, LinkMap, Named, OffsetText, OneOrMany, Port, Scalar, SignedSpan, TimeSpan,
+    split_link,
+};
+use self::scalar::{CountWord, Name};
+use self::words::{ClockSyncWord, CoordinationWord, OnExceedWord, OnFailureWord, WireWord};
 
 /// A federation: what runs, how it is connected, and how long.
 ///
@@ -28,6 +32,13 @@ pub(crate) struct Manifest {
     /// How tags are granted.
     #[schemars(with = "Option<CoordinationWord>")]
     pub(crate) coordination: Option<Coordination>,
+    /// Which of Lingua Franca's releases the messages between federates are like.
+    #[serde(default)]
+    #[schemars(with = "WireWord")]
+    pub(crate) wire: Wire,
+    /// Federates and coordinator prove to each other that they know the federation's id before they join.
+    #[serde(default)]
+    pub(crate) authentication: bool,
     /// The federation stops this long after its start tag; without it, it runs until it is stopped.
     pub(crate) timeout: Option<TimeSpan>,
     /// Run ahead of physical time, as fast as the machine can.
@@ -41,9 +52,16 @@ pub(crate) struct Manifest {
     /// Clock synchronization.
     #[serde(default)]
     pub(crate) clock: Clock,
+    /// What holds for every connection, as far as nothing else is said: the offsets of decentralized coordination
+    /// are made of it.
+    #[serde(default)]
+    pub(crate) bounds: AllBounds,
     /// The coordinator.
     #[serde(default)]
     pub(crate) rti: Rti,
+    /// Where the daemon serves what it has measured.
+    #[serde(default)]
+    pub(crate) metrics: Metrics,
     /// Values used as `$name` elsewhere; `--set name=value` replaces them.
     #[serde(default, rename = "let")]
     #[expect(dead_code, reason = "replaced in the document before it is read")]
@@ -70,10 +88,59 @@ pub(crate) struct Manifest {
 #[derive(Clone, Debug, Default, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct Clock {
-    /// `off` takes the host's clock as it is; `init` compares it with the coordinator's while joining.
+    /// When clocks are compared with the coordinator's.
     #[serde(default)]
     #[schemars(with = "ClockSyncWord")]
     pub(crate) sync: ClockSync,
+    /// The time between two exchanges with one federate, with `sync: on`.
+    pub(crate) period: Option<TimeSpan>,
+    /// Exchanges while joining, and per correction.
+    #[schemars(range(min = 1, max = 1000))]
+    pub(crate) trials: Option<u32>,
+    /// One correction takes away the measured error divided by this.
+    #[schemars(range(min = 1, max = 1000))]
+    pub(crate) attenuation: Option<u32>,
+    /// The largest error bound with which a federate may start.
+    pub(crate) max_error: Option<TimeSpan>,
+    /// What happens when a bound is larger.
+    #[serde(default)]
+    #[schemars(with = "OnExceedWord")]
+    pub(crate) on_exceed: OnExceed,
+}
+
+/// The bounds of every connection.
+#[derive(Clone, Debug, Default, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub(crate) struct AllBounds {
+    /// L: from the time at which the sender may begin a tag to the time at which the message leaves.
+    pub(crate) launch_lag: Option<TimeSpan>,
+    /// N: on the network.
+    pub(crate) latency: Option<TimeSpan>,
+    /// E: how far the two clocks are apart.
+    pub(crate) clock_error: Option<TimeSpan>,
+    /// Bounds between two federates, by `SENDER -> RECEIVER`; they come before those of the sender and of all.
+    #[serde(default)]
+    pub(crate) links: LinkMap<Bounds>,
+}
+
+/// Bounds that hold in place of the general ones.
+#[derive(Clone, Copy, Debug, Default, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub(crate) struct Bounds {
+    /// L: from the time at which the sender may begin a tag to the time at which the message leaves.
+    pub(crate) launch_lag: Option<TimeSpan>,
+    /// N: on the network.
+    pub(crate) latency: Option<TimeSpan>,
+    /// E: how far the two clocks are apart.
+    pub(crate) clock_error: Option<TimeSpan>,
+}
+
+/// Where the daemon serves what it has measured.
+#[derive(Clone, Copy, Debug, Default, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub(crate) struct Metrics {
+    /// An address and port for Prometheus, read only; left out, only the daemon's own socket.
+    pub(crate) listen: Option<Address>,
 }
 
 /// The coordinator.
@@ -120,6 +187,49 @@ pub(crate) struct Federate {
     /// Environment variables to add.
     #[serde(default)]
     pub(crate) env: Named<Scalar>,
+    /// How long after a tag's time it waits for messages (decentralized coordination); `auto` solves it from the bounds.
+    pub(crate) stp_offset: Option<OffsetText>,
+    /// L of everything it sends.
+    pub(crate) launch_lag: Option<TimeSpan>,
+    /// What its loss does to the others.
+    #[schemars(with = "Option<OnFailureWord>")]
+    pub(crate) on_failure: Option<OnFailure>,
+    /// What a message that comes too late does (decentralized coordination).
+    pub(crate) on_stp_violation: Option<ViolationPolicy>,
+    /// Tests only: a clock that is wrong on purpose.
+    #[serde(default)]
+    pub(crate) clock: TestClock,
+}
+
+/// What messages that come too late do besides being counted.
+#[derive(Clone, Copy, Debug, Deserialize, JsonSchema)]
+#[serde(untagged)]
+#[schemars(inline)]
+pub(crate) enum ViolationPolicy {
+    /// Nothing.
+    Count(CountWord),
+    /// Stop the federation.
+    Stop(ViolationLimit),
+}
+
+/// How many messages may come too late.
+#[derive(Clone, Copy, Debug, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub(crate) struct ViolationLimit {
+    /// The federate stops the federation with this one; 1 is the first.
+    #[schemars(required, range(min = 1))]
+    pub(crate) stop_after: Option<u32>,
+}
+
+/// A clock that is wrong on purpose.
+#[derive(Clone, Copy, Debug, Default, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub(crate) struct TestClock {
+    /// How far it is off when the federate begins; may be negative.
+    pub(crate) test_offset: Option<SignedSpan>,
+    /// Microseconds that it gains in a second; may be negative.
+    #[schemars(range(min = -100_000, max = 100_000))]
+    pub(crate) test_drift_ppm: Option<f64>,
 }
 
 /// The ports of a foreign federate.
@@ -175,6 +285,16 @@ pub(crate) struct Connection {
     pub(crate) serializer: Option<String>,
     /// The receiver's port id on the wire; only needed when a foreign sender has it compiled in.
     pub(crate) port_id: Option<u16>,
+    /// The tag is dropped: the receiver's clock gives a new one, `after` added.
+    #[serde(default)]
+    pub(crate) physical: bool,
+    /// The offset of this connection in place of its receiver's.
+    pub(crate) stp_offset: Option<TimeSpan>,
+    /// How much longer the receiver waits, at a tag that it has begun, before it takes this input for absent.
+    pub(crate) absent_after: Option<TimeSpan>,
+    /// The bounds of this connection alone.
+    #[serde(default)]
+    pub(crate) bounds: Bounds,
 }
 
 /// What holds for the whole run.
@@ -185,6 +305,13 @@ pub(crate) struct Defaults {
     pub(crate) stop_grace: Option<TimeSpan>,
     /// How long federates may take to join.
     pub(crate) join_timeout: Option<TimeSpan>,
+    /// The `stp_offset` of federates that have none of their own; left out, `auto`.
+    pub(crate) stp_offset: Option<OffsetText>,
+    /// The `on_failure` of federates that have none of their own; left out, `stop-federation`.
+    #[schemars(with = "Option<OnFailureWord>")]
+    pub(crate) on_failure: Option<OnFailure>,
+    /// The `on_stp_violation` of federates that have none of their own; left out, `count`.
+    pub(crate) on_stp_violation: Option<ViolationPolicy>,
     /// The bounds of the log files.
     #[serde(default)]
     pub(crate) logs: Logs,
@@ -269,198 +396,6 @@ pub(crate) struct Hop {
     pub(crate) sampled: bool,
 }
 
-/// One text or a list of them.
-#[derive(Clone, Debug, Deserialize, JsonSchema)]
-#[serde(untagged)]
-#[schemars(inline)]
-pub(crate) enum OneOrMany {
-    /// One.
-    One(String),
-    /// Several.
-    Many(Vec<String>),
-}
-
-impl OneOrMany {
-    /// The texts.
-    pub(crate) fn as_slice(&self) -> &[String] {
-        match self {
-            Self::One(one) => std::slice::from_ref(one),
-            Self::Many(many) => many,
-        }
-    }
-
-    /// Whether it was written as a list.
-    pub(crate) fn is_list(&self) -> bool {
-        matches!(self, Self::Many(_))
-    }
-}
-
-/// A text, number or boolean, as a text.
-#[derive(Clone, Debug, PartialEq, Deserialize, JsonSchema)]
-#[serde(untagged)]
-#[schemars(inline)]
-pub(crate) enum Scalar {
-    /// A boolean.
-    Bool(bool),
-    /// An integer.
-    Integer(i64),
-    /// A number.
-    Number(f64),
-    /// A text.
-    Text(String),
-}
-
-impl fmt::Display for Scalar {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self {
-            Self::Bool(value) => value.fmt(f),
-            Self::Integer(value) => value.fmt(f),
-            Self::Number(value) => value.fmt(f),
-            Self::Text(value) => value.fmt(f),
-        }
-    }
-}
-
-/// A TCP port, or `auto`.
-#[derive(Clone, Debug, Deserialize, JsonSchema)]
-#[serde(untagged)]
-#[schemars(inline)]
-pub(crate) enum Port {
-    /// This one.
-    Number(#[schemars(range(min = 1, max = 65535))] u16),
-    /// `auto`.
-    Word(AutoWord),
-}
-
-/// The word `auto`.
-#[derive(Clone, Copy, Debug, Deserialize, JsonSchema)]
-#[serde(rename_all = "lowercase")]
-#[schemars(inline)]
-pub(crate) enum AutoWord {
-    /// Any free one.
-    Auto,
-}
-
-/// A mapping from names, in the order of the text.
-#[derive(Clone, Debug)]
-pub(crate) struct Named<T>(pub(crate) Vec<(String, T)>);
-
-impl<T> Default for Named<T> {
-    fn default() -> Self {
-        Self(Vec::new())
-    }
-}
-
-impl<T> Named<T> {
-    /// The value of a name.
-    pub(crate) fn get(&self, name: &str) -> Option<&T> {
-        self.0
-            .iter()
-            .find(|(have, _)| have == name)
-            .map(|(_, value)| value)
-    }
-
-    /// The names.
-    pub(crate) fn names(&self) -> impl Iterator<Item = &str> {
-        self.0.iter().map(|(name, _)| name.as_str())
-    }
-
-    /// Whether there is none.
-    pub(crate) fn is_empty(&self) -> bool {
-        self.0.is_empty()
-    }
-}
-
-impl<'de, T: Deserialize<'de>> Deserialize<'de> for Named<T> {
-    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
-        struct NamedVisitor<T>(PhantomData<T>);
-        impl<'de, T: Deserialize<'de>> Visitor<'de> for NamedVisitor<T> {
-            type Value = Named<T>;
-            fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-                f.write_str("a mapping")
-            }
-            fn visit_unit<E>(self) -> Result<Named<T>, E> {
-                Ok(Named::default())
-            }
-            fn visit_map<A: MapAccess<'de>>(self, mut map: A) -> Result<Named<T>, A::Error> {
-                let mut entries = Vec::new();
-                while let Some(entry) = map.next_entry()? {
-                    entries.push(entry);
-                }
-                Ok(Named(entries))
-            }
-        }
-        deserializer.deserialize_map(NamedVisitor(PhantomData))
-    }
-}
-
-impl<T: JsonSchema> JsonSchema for Named<T> {
-    fn inline_schema() -> bool {
-        true
-    }
-    fn schema_name() -> std::borrow::Cow<'static, str> {
-        format!("Named{}", T::schema_name()).into()
-    }
-    fn json_schema(generator: &mut SchemaGenerator) -> Schema {
-        json_schema!({
-            "type": "object",
-            "propertyNames": Name::json_schema(generator),
-            "additionalProperties": generator.subschema_for::<T>(),
-        })
-    }
-}
-
-macro_rules! text_with_format {
-    ($(#[$doc:meta])* $name:ident($inner:ty), $format:literal, $pattern:literal) => {
-        $(#[$doc])*
-        #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
-        pub(crate) struct $name(pub(crate) $inner);
-
-        impl JsonSchema for $name {
-            fn inline_schema() -> bool {
-                true
-            }
-            fn schema_name() -> std::borrow::Cow<'static, str> {
-                $format.into()
-            }
-            fn json_schema(_: &mut SchemaGenerator) -> Schema {
-                json_schema!({ "type": "string", "format": $format, "pattern": $pattern })
-            }
-        }
-    };
-}
-
-text_with_format! {
-    /// A duration in nanoseconds, written `10 ms`.
-    TimeSpan(i64), "ictus-duration",
-    r"^\s*[0-9]+(\.[0-9]+)?\s*(ns|nsec|us|usec|ms|msec|s|sec|min|h)\s*$"
-}
-text_with_format! {
-    /// A size in bytes, written `10 MiB`.
-    ByteSize(u64), "ictus-size", r"^\s*[0-9]+(\.[0-9]+)?\s*(B|kB|KiB|MB|MiB|GB|GiB)\s*$"
-}
-text_with_format! {
-    /// A name: a letter, then letters, digits, `_` and `-`.
-    Name(()), "ictus-name", r"^[A-Za-z][A-Za-z0-9_-]{0,63}$"
-}
-
-impl<'de> Deserialize<'de> for TimeSpan {
-    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
-        let text = String::deserialize(deserializer)?;
-        let span = quantity::duration(&text).map_err(serde::de::Error::custom)?;
-        Ok(Self(span.as_nanos()))
-    }
-}
-
-impl<'de> Deserialize<'de> for ByteSize {
-    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
-        let text = String::deserialize(deserializer)?;
-        quantity::size(&text)
-            .map(Self)
-            .map_err(serde::de::Error::custom)
-    }
-}
-
 /// The name under which logs, events and exits speak of the RTI; no federate has it.
 pub const COORDINATOR: &str = "rti";
 
@@ -476,28 +411,6 @@ pub(crate) fn is_name(text: &str) -> bool {
 
 fn version(_: &mut SchemaGenerator) -> Schema {
     json_schema!({ "type": "string", "const": ictus_coord::plan::FORMAT })
-}
-
-/// The words of [`Coordination`], for the schema.
-#[derive(JsonSchema)]
-#[serde(rename_all = "lowercase")]
-#[schemars(inline)]
-#[expect(dead_code, reason = "only its schema is used")]
-enum CoordinationWord {
-    /// By the RTI: consistency first.
-    Centralized,
-}
-
-/// The words of [`ClockSync`], for the schema.
-#[derive(JsonSchema)]
-#[serde(rename_all = "lowercase")]
-#[schemars(inline)]
-#[expect(dead_code, reason = "only its schema is used")]
-enum ClockSyncWord {
-    /// No exchanges; the host's clock is taken as it is.
-    Off,
-    /// Ten exchanges with the coordinator while joining.
-    Init,
 }
 
 /// The JSON Schema of [`Manifest`].

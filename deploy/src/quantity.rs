@@ -49,6 +49,16 @@ pub(crate) fn duration(text: &str) -> Result<Duration, QuantityError> {
     parse(text, TIME).map(Duration::from_nanos)
 }
 
+/// Reads a duration that may have a sign: `-50 ms`.
+pub(crate) fn signed_duration(text: &str) -> Result<Duration, QuantityError> {
+    let text = text.trim();
+    let (sign, rest) = match text.strip_prefix('-') {
+        Some(rest) => (-1, rest),
+        None => (1, text.strip_prefix('+').unwrap_or(text)),
+    };
+    parse(rest, TIME).map(|nanos| Duration::from_nanos(sign * nanos))
+}
+
 /// Reads a size in bytes such as `10 MiB`.
 pub(crate) fn size(text: &str) -> Result<u64, QuantityError> {
     parse(text, SIZE).map(i64::unsigned_abs)
@@ -116,6 +126,10 @@ mod tests {
             nanos("99999999999 h"),
             Err("`99999999999 h` cannot be represented exactly".into())
         );
+        let signed = |text: &str| signed_duration(text).ok().map(Duration::as_nanos);
+        assert_eq!(signed("-50 ms"), Some(-50_000_000));
+        assert_eq!(signed("+1 ns"), Some(1));
+        assert_eq!(signed("--1 ns"), None);
         assert_eq!(size("10 MiB"), Ok(10 << 20));
         assert_eq!(size("1.5 kB"), Ok(1500));
     }

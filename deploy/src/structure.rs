@@ -2,6 +2,7 @@
 //! is wrong is reported and cut out, so that the rest can be checked for meaning.
 
 use std::collections::BTreeMap;
+use std::net::SocketAddr;
 
 use serde_json::Value as Json;
 
@@ -9,6 +10,9 @@ use crate::document::{Key, Node, Part, Value};
 use crate::manifest::{COORDINATOR, is_name};
 use crate::problem::{Place, Report};
 use crate::{quantity, suggest};
+
+/// What people write for a time without end.
+const INFINITE: [&str; 5] = ["forever", "inf", "infinite", "infinity", "never"];
 
 /// Reports every departure of `root` from `schema`; returns what is left without them.
 pub(crate) fn prune(schema: &Json, root: &Node, report: &mut Report) -> Node {
@@ -49,7 +53,9 @@ impl<'a> Walker<'a> {
             }
             Value::List(items) if allows(schema, "array") => Some(self.list(schema, node, items)),
             Value::Integer(value) if allows(schema, "integer") => self.range(schema, node, *value),
-            Value::Float(_) | Value::Integer(_) if allows(schema, "number") => Some(node.clone()),
+            Value::Float(_) | Value::Integer(_) if allows(schema, "number") => {
+                self.number(schema, node)
+            }
             Value::Bool(_) if allows(schema, "boolean") => Some(node.clone()),
             Value::Text(text) if allows(schema, "string") => self.text(schema, node, text),
             Value::Null
@@ -198,12 +204,53 @@ impl<'a> Walker<'a> {
         None
     }
 
+    /// A number within the bounds of its schema.
+    fn number(&mut self, schema: &Json, node: &Node) -> Option<Node> {
+        let text = match &node.value {
+            Value::Integer(value) => value.to_string(),
+            Value::Float(value) => value.to_string(),
+            Value::Null | Value::Bool(_) | Value::Text(_) | Value::List(_) | Value::Map(_) => {
+                return Some(node.clone());
+            }
+        };
+        let bound = |name: &str| schema.get(name).and_then(Json::as_f64);
+        let (Some(least), Some(most)) = (bound("minimum"), bound("maximum")) else {
+            return Some(node.clone());
+        };
+        if text
+            .parse()
+            .is_ok_and(|value: f64| (least..=most).contains(&value))
+        {
+            return Some(node.clone());
+        }
+        let message = format!("{text} is not between {least} and {most}");
+        self.report
+            .add("F005", Place::new(&self.path, Part::Value), message, "");
+        None
+    }
+
     fn text(&mut self, schema: &Json, node: &Node, text: &str) -> Option<Node> {
         let (code, message, fix) = match schema.get("format").and_then(Json::as_str) {
             Some("ictus-duration") => match quantity::duration(text) {
                 Ok(_) => return Some(node.clone()),
                 Err(error) => ("F006", error.to_string(), duration_fix(text)),
             },
+            Some("ictus-signed-duration") => match quantity::signed_duration(text) {
+                Ok(_) => return Some(node.clone()),
+                Err(error) => ("F006", error.to_string(), duration_fix(text)),
+            },
+            Some("ictus-offset") => match offset(text) {
+                Ok(()) => return Some(node.clone()),
+                Err((message, fix)) => ("F006", message, fix),
+            },
+            Some("ictus-address") if text.trim().parse::<SocketAddr>().is_err() => {
+                let fix = "write it as `127.0.0.1:9464`";
+                (
+                    "F005",
+                    format!("`{text}` is not an address with a port"),
+                    fix.to_owned(),
+                )
+            }
             Some("ictus-size") => match quantity::size(text) {
                 Ok(_) => return Some(node.clone()),
                 Err(error) => ("F006", error.to_string(), "write it as `10 MiB`".to_owned()),
@@ -234,8 +281,20 @@ impl<'a> Walker<'a> {
             return None;
         }
         let message = format!("expected `{}`, found {}", words.join("` or `"), node.kind());
+        let fix = match &node.value {
+            Value::Float(number) if words.contains(&number.to_string().as_str()) => {
+                format!("quote it: `\"{number}\"`")
+            }
+            Value::Null
+            | Value::Bool(_)
+            | Value::Integer(_)
+            | Value::Float(_)
+            | Value::Text(_)
+            | Value::List(_)
+            | Value::Map(_) => String::new(),
+        };
         self.report
-            .add("F005", Place::new(&self.path, Part::Value), message, "");
+            .add("F005", Place::new(&self.path, Part::Value), message, fix);
         None
     }
 
@@ -271,7 +330,7 @@ impl<'a> Walker<'a> {
         };
         let place = Place::new(&self.path, Part::Value);
         let (code, message, fix) = match (format, number) {
-            (Some("ictus-duration"), Some(number)) => (
+            (Some("ictus-duration" | "ictus-signed-duration" | "ictus-offset"), Some(number)) => (
                 "F006",
                 format!("`{number}` has no unit"),
                 duration_fix(&number),
@@ -325,6 +384,26 @@ fn missing_fix(name: &str) -> &'static str {
         "federation" => "name the federation: `federation: NAME`",
         _ => "",
     }
+}
+
+/// Whether a text is an offset; else what is wrong and how to mend it.
+fn offset(text: &str) -> Result<(), (String, String)> {
+    let text = text.trim();
+    if text == "auto" || quantity::duration(text).is_ok() {
+        return Ok(());
+    }
+    let fix = "write it as `5 ms`, or `auto` to have it solved from the bounds".to_owned();
+    let message = if quantity::signed_duration(text).is_ok() {
+        format!("an offset is not negative: `{text}`")
+    } else if INFINITE.contains(&text.to_lowercase().trim_start_matches('.')) {
+        format!("an offset is finite: with `{text}`, one lost message would stop everything")
+    } else {
+        match quantity::duration(text) {
+            Ok(_) => return Ok(()),
+            Err(error) => error.to_string(),
+        }
+    };
+    Err((message, fix))
 }
 
 fn duration_fix(text: &str) -> String {
@@ -385,7 +464,9 @@ fn alternatives(schema: &Json) -> Option<&[Json]> {
 /// What a schema wants, as a person says it.
 fn describe(schema: &Json) -> Option<String> {
     let format = match schema.get("format").and_then(Json::as_str) {
-        Some("ictus-duration") => Some("a duration such as `10 ms`"),
+        Some("ictus-duration" | "ictus-signed-duration") => Some("a duration such as `10 ms`"),
+        Some("ictus-offset") => Some("a duration such as `10 ms`, or `auto`"),
+        Some("ictus-address") => Some("an address such as `127.0.0.1:9464`"),
         Some("ictus-size") => Some("a size such as `10 MiB`"),
         Some("ictus-name") => Some("a name"),
         _ => None,

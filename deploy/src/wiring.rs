@@ -253,7 +253,10 @@ impl<'a> Wiring<'a, '_> {
                     after_ns: connection.after.map(|after| after.0),
                     serializer: serializer.clone(),
                     port_id: 0,
-                    ..ConnectionPlan::default()
+                    physical: connection.physical,
+                    stp_offset_ns: connection.stp_offset.map(|offset| offset.0),
+                    absent_after_ns: connection.absent_after.map_or(0, |wait| wait.0),
+                    bounds: None,
                 },
             });
         }

@@ -10,6 +10,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
+use ictus_coord::plan::{ClockPlan, ClockSync, Coordination, OnFailure, Wire};
 use ictus_deploy::{CheckOptions, Checked, FederateKind, Problems, Progress, check};
 
 /// A folder with a manifest and `bin/NAME` for every name the fake program knows.
@@ -103,10 +104,11 @@ fn the_example_is_a_federation() {
         .iter()
         .map(|wire| {
             format!(
-                "{}.{}[{}] -> {}.{}[{}] after {:?} {} #{}",
+                "{}.{}[{}] {}> {}.{}[{}] after {:?} {} #{}",
                 wire.from.federate,
                 wire.from.port,
                 wire.from.channel,
+                if wire.physical { '~' } else { '-' },
                 wire.to.federate,
                 wire.to.port,
                 wire.to.channel,
@@ -123,7 +125,7 @@ fn the_example_is_a_federation() {
             "1.command[0] -> 2.command[0] after None native #0",
             "1.command[0] -> 2.copy[0] after None native #1",
             "1.wish[0] -> 3.trigger[0] after Some(0) native #0",
-            "3.frame[0] -> 1.frame[0] after None native #4",
+            "3.frame[0] ~> 1.frame[0] after None native #4",
             "0.points[0] -> 2.points[0] after None postcard #2",
             "0.points[1] -> 2.points[1] after None postcard #3",
         ]
@@ -155,6 +157,107 @@ fn the_example_is_a_federation() {
         })
         .collect();
     assert_eq!(hops, [(5_000_000, 0, true, 1), (0, 0, false, 2)]);
+}
+
+/// What the manifest says of coordination, clocks and policies stands in the plan.
+#[test]
+fn the_example_is_decentralized() {
+    let bench = Bench::new(&example());
+    let checked = bench
+        .check(&CheckOptions::default())
+        .unwrap_or_else(|p| panic!("{p}"));
+    let plan = &checked.plan;
+    assert_eq!(plan.coordination, Coordination::Decentralized);
+    assert_eq!((plan.wire, plan.authentication), (Wire::V0_12, true));
+    let clock = ClockPlan {
+        sync: ClockSync::On,
+        max_error_ns: Some(500_000),
+        ..ClockPlan::default()
+    };
+    assert_eq!(plan.clock, clock);
+    let listen = checked.settings.metrics_listen;
+    assert_eq!(listen, Some("127.0.0.1:9464".parse().unwrap()));
+    let [radar, planner, logger, camera] = plan.federates.as_slice() else {
+        panic!("{plan:?}")
+    };
+    assert_eq!(radar.test_clock_offset_ns, -50_000_000);
+    assert_eq!(radar.test_clock_drift_ppb, 50_000);
+    assert_eq!(planner.max_stp_violations, Some(10));
+    assert_eq!(logger.max_stp_violations, None);
+    assert_eq!(logger.on_failure, OnFailure::Continue);
+    assert_eq!(planner.on_failure, OnFailure::StopFederation);
+    let offsets = [radar, planner, logger, camera].map(|one| one.stp_offset_ns);
+    assert_eq!(offsets, [0, 500_000, 7_500_000, 6_000_000]);
+    let wires: Vec<_> = plan
+        .connections
+        .iter()
+        .map(|wire| (wire.stp_offset_ns, wire.absent_after_ns))
+        .collect();
+    let own = (Some(8_000_000), 1_000_000);
+    let points = (Some(5_500_000), 0);
+    assert_eq!(
+        wires,
+        [
+            (Some(500_000), 0),
+            own,
+            own,
+            (None, 0),
+            (None, 0),
+            points,
+            points
+        ]
+    );
+    assert_eq!(
+        checked.offsets.unwrap().to_string(),
+        "\
+radar 0 ms: no input to wait for
+planner 0.5 ms = radar offset 0 + radar launch lag 1.0 + network 4.0 + clock 0.5 - after 5.0
+logger 7.5 ms = planner offset 0.5 + planner launch lag 2.0 + network 4.0 + clock 1.0 - after 0
+camera 6.0 ms as declared; required 6.0 ms = planner offset 0.5 + planner launch lag 2.0 + network 3.0 + clock 0.5 \
+         - after 0"
+    );
+    let warnings: Vec<&str> = checked.warnings.iter().map(|one| one.code).collect();
+    assert_eq!(warnings, ["W003"], "only `max_lead` has no effect");
+}
+
+/// The line of the issue, word for word.
+#[test]
+fn a_breakdown_names_every_term() {
+    let bench = Bench::new(
+        "ictus: v1\nfederation: f\ncoordination: decentralized\n\
+         programs: { fake: { binary: bin/fake } }\n\
+         bounds:\n  launch_lag: 200 us\n  latency: 600 us\n  clock_error: 100 us\n  \
+         links: { planner -> brake: { launch_lag: 2 ms, latency: 3 ms, clock_error: 500 us } }\n\
+         federates:\n  lidar: { class: Relay }\n  planner: { class: Relay }\n  brake: { class: Relay }\n\
+         connections:\n  - { from: lidar.out, to: planner.input }\n  \
+         - { from: planner.out, to: brake.input }\n",
+    );
+    let checked = bench.check(&CheckOptions::default());
+    let offsets = checked.unwrap_or_else(|p| panic!("{p}")).offsets.unwrap();
+    assert_eq!(
+        offsets.to_string().lines().last().unwrap(),
+        "brake 6.4 ms = planner offset 0.9 + planner launch lag 2.0 + network 3.0 + clock 0.5 - after 0"
+    );
+}
+
+/// Under centralized coordination nothing is asked and nothing is written into the plan; what can be solved is told.
+#[test]
+fn centralized_plans_have_no_offsets() {
+    let text = example().replace("coordination: decentralized", "coordination: centralized");
+    let checked = Bench::new(&text).check(&CheckOptions::default());
+    let checked = checked.unwrap_or_else(|p| panic!("{p}"));
+    assert!(
+        checked
+            .plan
+            .federates
+            .iter()
+            .all(|one| one.stp_offset_ns == 0)
+    );
+    assert_eq!(checked.offsets.unwrap().federates[2].used_ns, 7_500_000);
+    let without = text.replace("\n  clock_error: 500 us ", "\n  # ");
+    assert_ne!(text, without);
+    let checked = Bench::new(&without).check(&CheckOptions::default());
+    assert_eq!(checked.unwrap_or_else(|p| panic!("{p}")).offsets, None);
 }
 
 #[test]

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
-use ictus_coord::plan::ClockSync;
+use ictus_coord::plan::{ClockSync, OnFailure, Wire};
 use ictus_deploy::{FederateKind, FederateRun};
 
 use crate::agent::{MemberId, RTI};
@@ -71,26 +71,39 @@ fn passed_on() -> BTreeMap<String, String> {
 }
 
 fn rti_args(request: &StartRequest, federation_id: &str) -> Vec<String> {
-    let clock = match request.settings.clock {
+    let plan = &request.plan;
+    let clock = match plan.clock.sync {
         ClockSync::Off | ClockSync::External => "off",
         ClockSync::Init => "init",
         ClockSync::On => "on",
     };
     let federates = request.federates.len().to_string();
     let port = request.settings.rti_port.unwrap_or(0).to_string();
-    [
-        "rti",
-        "-i",
-        federation_id,
-        "-n",
-        &federates,
-        "-p",
-        &port,
-        "-c",
-        clock,
-    ]
-    .map(str::to_owned)
-    .to_vec()
+    let mut args = vec!["rti", "-i", federation_id, "-n", &federates, "-p", &port];
+    let (period, trials) = (
+        plan.clock.period_ns.to_string(),
+        plan.clock.trials.to_string(),
+    );
+    args.extend(["-c", clock]);
+    if clock != "off" {
+        args.extend(["period", &period, "exchanges-per-interval", &trials]);
+    }
+    if plan.authentication {
+        args.push("-a");
+    }
+    if plan.wire == Wire::V0_13 {
+        args.extend(["--wire", "0.13"]);
+    }
+    let go_on: Vec<String> = (0_u16..)
+        .zip(&plan.federates)
+        .filter(|(_, federate)| federate.on_failure == OnFailure::Continue)
+        .map(|(id, _)| id.to_string())
+        .collect();
+    let go_on = go_on.join(",");
+    if !go_on.is_empty() {
+        args.extend(["--continue", &go_on]);
+    }
+    args.into_iter().map(str::to_owned).collect()
 }
 
 fn federate_args(

@@ -11,7 +11,7 @@
 
 use std::fmt;
 
-use crate::plan::{Bounds, Plan};
+use crate::plan::{Bounds, ConnectionPlan};
 use crate::topology::FederateId;
 
 /// A connection between two federates, as far as the solver needs it.
@@ -94,23 +94,20 @@ pub struct PositiveCycle {
     pub after_ns: i64,
 }
 
-/// The links of a plan: connections that carry tags from one federate to another. Each comes with the index of
-/// its connection. What the plan's connections declare counts; the offsets of its federates do not.
-pub fn links(plan: &Plan) -> impl Iterator<Item = (usize, Link)> {
-    let tagged = plan.connections.iter().enumerate();
-    tagged
-        .filter(|(_, wire)| !wire.physical && wire.from.federate != wire.to.federate)
-        .map(|(index, wire)| {
-            let link = Link {
-                from: FederateId::new(wire.from.federate),
-                to: FederateId::new(wire.to.federate),
-                bounds: wire.bounds,
-                after_ns: wire.after_ns.unwrap_or(0),
-                absent_after_ns: wire.absent_after_ns,
-                declared_ns: wire.stp_offset_ns,
-            };
-            (index, link)
+impl Link {
+    /// The link of a connection, when it carries tags from one federate to another. An offset that the connection
+    /// has counts as declared.
+    #[must_use]
+    pub fn of(wire: &ConnectionPlan) -> Option<Self> {
+        (!wire.physical && wire.from.federate != wire.to.federate).then(|| Self {
+            from: FederateId::new(wire.from.federate),
+            to: FederateId::new(wire.to.federate),
+            bounds: wire.bounds,
+            after_ns: wire.after_ns.unwrap_or(0),
+            absent_after_ns: wire.absent_after_ns,
+            declared_ns: wire.stp_offset_ns,
         })
+    }
 }
 
 /// Solves the system. `declared` has one entry per federate: its S, when the manifest gives it.
@@ -157,11 +154,7 @@ pub fn solve(links: &[Link], declared: &[Option<i64>]) -> Result<Solution, Solve
 
 impl Solution {
     /// Gathers what follows from the fixed point.
-    fn new(
-        links: &[Link],
-        declared: &[Option<i64>],
-        decided: &[i128],
-    ) -> Result<Self, SolveError> {
+    fn new(links: &[Link], declared: &[Option<i64>], decided: &[i128]) -> Result<Self, SolveError> {
         let mut federates: Vec<Offset> = Vec::with_capacity(declared.len());
         for (id, until) in decided.iter().enumerate() {
             let decided_ns = i64::try_from(*until)
@@ -207,7 +200,11 @@ impl Solution {
 /// L + N + E - α.
 fn weight(link: &Link) -> Option<i128> {
     let bounds = link.bounds?;
-    let lags = [bounds.launch_lag_ns, bounds.latency_ns, bounds.clock_error_ns];
+    let lags = [
+        bounds.launch_lag_ns,
+        bounds.latency_ns,
+        bounds.clock_error_ns,
+    ];
     Some(lags.map(i128::from).iter().sum::<i128>() - i128::from(link.after_ns))
 }
 

@@ -3,7 +3,7 @@
 use proptest::prelude::*;
 
 use super::*;
-use crate::plan::{ConnectionPlan, Endpoint, FederatePlan};
+use crate::plan::Endpoint;
 
 const US: i64 = 1_000;
 const MS: i64 = 1_000_000;
@@ -26,13 +26,20 @@ fn link(from: u16, to: u16, [l, n, e, after]: [i64; 4]) -> Link {
 
 fn offsets(links: &[Link], federates: usize) -> Vec<i64> {
     let solution = solve(links, &vec![None; federates]).unwrap();
-    solution.federates.iter().map(|one| one.used_ns / US).collect()
+    solution
+        .federates
+        .iter()
+        .map(|one| one.used_ns / US)
+        .collect()
 }
 
 /// lidar -> planner -> brake: 0; 0.2 + 0.6 + 0.1 = 0.9; 0.9 + 2 + 3 + 0.5 = 6.4.
 #[test]
 fn a_chain() {
-    let links = [link(0, 1, [200, 600, 100, 0]), link(1, 2, [2000, 3000, 500, 0])];
+    let links = [
+        link(0, 1, [200, 600, 100, 0]),
+        link(1, 2, [2000, 3000, 500, 0]),
+    ];
     assert_eq!(offsets(&links, 3), [0, 900, 6400]);
     let solution = solve(&links, &[None; 3]).unwrap();
     assert_eq!(solution.federates[0].by, None);
@@ -53,7 +60,13 @@ fn a_diamond() {
     assert_eq!(offsets(&links, 4), [0, 2000, 2000, 4000]);
     let solution = solve(&links, &[None; 4]).unwrap();
     assert_eq!(solution.federates[3].by, Some(2));
-    assert_eq!(solution.links[3], LinkOffset { required_ns: Some(2000 * US), used_ns: 2000 * US });
+    assert_eq!(
+        solution.links[3],
+        LinkOffset {
+            required_ns: Some(2000 * US),
+            used_ns: 2000 * US
+        }
+    );
 }
 
 /// An `after` longer than everything else needs no offset; the requirement below 0 is told all the same.
@@ -62,7 +75,13 @@ fn a_long_delay_needs_no_offset() {
     let links = [link(0, 1, [1000, 2000, 0, 10_000])];
     let solution = solve(&links, &[None; 2]).unwrap();
     assert_eq!(solution.federates[1].used_ns, 0);
-    assert_eq!(solution.links[0], LinkOffset { required_ns: Some(-7 * MS), used_ns: 0 });
+    assert_eq!(
+        solution.links[0],
+        LinkOffset {
+            required_ns: Some(-7 * MS),
+            used_ns: 0
+        }
+    );
 }
 
 /// The terms of the cycle cancel: what enters it goes around once and no further.
@@ -93,7 +112,10 @@ fn a_positive_cycle_is_refused_and_named() {
     );
     assert_eq!(cycle.links, [2, 1]);
     // Declared offsets hide it from nobody: a round still takes longer than it may.
-    assert!(matches!(solve(&links, &[None, Some(MS), Some(MS)]), Err(SolveError::Cycle(_))));
+    assert!(matches!(
+        solve(&links, &[None, Some(MS), Some(MS)]),
+        Err(SolveError::Cycle(_))
+    ));
 }
 
 /// One nanosecond decides.
@@ -102,7 +124,10 @@ fn the_least_positive_cycle_is_refused() {
     let mut links = [link(0, 1, [1000, 0, 0, 0]), link(1, 0, [0, 0, 0, 1000])];
     assert_eq!(offsets(&links, 2), [0, 1000]);
     links[1].after_ns -= 1;
-    assert!(matches!(solve(&links, &[None; 2]), Err(SolveError::Cycle(_))));
+    assert!(matches!(
+        solve(&links, &[None; 2]),
+        Err(SolveError::Cycle(_))
+    ));
 }
 
 /// What a federate declares, its receivers reckon with, be it more or less than is required.
@@ -117,7 +142,13 @@ fn declared_offsets_replace_solved_ones() {
     }
     // One that waits for nobody has nothing to decide, whatever it declares.
     let solution = solve(&links, &[Some(9 * MS), None, None]).unwrap();
-    assert_eq!((solution.federates[0].decided_ns, solution.federates[1].used_ns), (0, MS));
+    assert_eq!(
+        (
+            solution.federates[0].decided_ns,
+            solution.federates[1].used_ns
+        ),
+        (0, MS)
+    );
 }
 
 /// A link's own offset replaces its receiver's, and its `absent_after` delays what the receiver sends.
@@ -140,30 +171,39 @@ fn links_without_bounds_need_an_offset() {
     let solution = solve(&links, &[None, Some(0)]).unwrap();
     assert_eq!(solution.federates[1].required_ns, None);
     links[0].to = FederateId::new(7);
-    assert_eq!(solve(&links, &[None; 2]), Err(SolveError::UnknownFederate(0)));
+    assert_eq!(
+        solve(&links, &[None; 2]),
+        Err(SolveError::UnknownFederate(0))
+    );
 }
 
 #[test]
 fn sums_beyond_the_range_are_errors() {
     let far = i64::MAX / US;
     let links = [link(0, 1, [far, far, 0, 0]), link(1, 2, [far, 0, 0, 0])];
-    assert_eq!(solve(&links, &[None; 3]), Err(SolveError::TooLong(FederateId::new(1))));
+    assert_eq!(
+        solve(&links, &[None; 3]),
+        Err(SolveError::TooLong(FederateId::new(1)))
+    );
 }
 
 #[test]
 fn physical_connections_and_those_inside_a_federate_take_no_part() {
     let wire = |from, to, physical| ConnectionPlan {
-        from: Endpoint { federate: from, ..Endpoint::default() },
-        to: Endpoint { federate: to, ..Endpoint::default() },
+        from: Endpoint {
+            federate: from,
+            ..Endpoint::default()
+        },
+        to: Endpoint {
+            federate: to,
+            ..Endpoint::default()
+        },
         physical,
         ..ConnectionPlan::default()
     };
-    let plan = Plan {
-        federates: vec![FederatePlan::default(); 2],
-        connections: vec![wire(0, 0, false), wire(0, 1, true), wire(0, 1, false)],
-        ..Plan::default()
-    };
-    assert_eq!(links(&plan).map(|(index, _)| index).collect::<Vec<_>>(), [2]);
+    assert_eq!(Link::of(&wire(0, 0, false)), None);
+    assert_eq!(Link::of(&wire(0, 1, true)), None);
+    assert_eq!(Link::of(&wire(0, 1, false)).unwrap().to, FederateId::new(1));
 }
 
 #[test]
@@ -171,17 +211,34 @@ fn milliseconds_are_exact() {
     let shown = [0, 2 * MS, 200 * US, -1, 1_500 * MS, i64::MIN].map(milliseconds);
     assert_eq!(
         shown,
-        ["0", "2", "0.2", "-0.000001", "1500", "-9223372036854.775808"]
+        [
+            "0",
+            "2",
+            "0.2",
+            "-0.000001",
+            "1500",
+            "-9223372036854.775808"
+        ]
     );
 }
 
 /// Links among `count` federates; half of the systems have no cycle, the others may have positive ones.
 fn systems() -> impl Strategy<Value = (usize, Vec<Link>)> {
     (1_u16..7, any::<bool>()).prop_flat_map(|(count, forward)| {
-        let one = (0..count, 0..count, [0_i64..9, 0_i64..9, 0_i64..9, 0_i64..30]);
+        let one = (
+            0..count,
+            0..count,
+            [0_i64..9, 0_i64..9, 0_i64..9, 0_i64..30],
+        );
         prop::collection::vec(one, 0..12).prop_map(move |all| {
-            let kept = all.into_iter().filter(|(from, to, _)| from != to && (!forward || from < to));
-            (usize::from(count), kept.map(|(from, to, terms)| link(from, to, terms)).collect())
+            let kept = all
+                .into_iter()
+                .filter(|(from, to, _)| from != to && (!forward || from < to));
+            (
+                usize::from(count),
+                kept.map(|(from, to, terms)| link(from, to, terms))
+                    .collect(),
+            )
         })
     })
 }
@@ -189,19 +246,22 @@ fn systems() -> impl Strategy<Value = (usize, Vec<Link>)> {
 /// Whether some simple cycle is positive, by trying all of them.
 fn brute_positive(links: &[Link], count: usize) -> bool {
     fn walk(links: &[Link], start: usize, at: usize, seen: &mut Vec<bool>, sum: i128) -> bool {
-        links.iter().filter(|one| one.from.index() == at).any(|one| {
-            let (to, sum) = (one.to.index(), sum + weight(one).unwrap());
-            if to == start {
-                return sum > 0;
-            }
-            if seen[to] {
-                return false;
-            }
-            seen[to] = true;
-            let found = walk(links, start, to, seen, sum);
-            seen[to] = false;
-            found
-        })
+        links
+            .iter()
+            .filter(|one| one.from.index() == at)
+            .any(|one| {
+                let (to, sum) = (one.to.index(), sum + weight(one).unwrap());
+                if to == start {
+                    return sum > 0;
+                }
+                if seen[to] {
+                    return false;
+                }
+                seen[to] = true;
+                let found = walk(links, start, to, seen, sum);
+                seen[to] = false;
+                found
+            })
     }
     (0..count).any(|start| {
         let mut seen = vec![false; count];
