@@ -91,12 +91,8 @@ fn the_example_is_a_federation() {
         .check(&CheckOptions::default())
         .unwrap_or_else(|p| panic!("{p}"));
     let plan = &checked.plan;
-    let names: Vec<&str> = plan
-        .federates
-        .iter()
-        .map(|federate| federate.name.as_str())
-        .collect();
-    assert_eq!(names, ["radar", "planner", "logger", "camera"]);
+    let names = plan.federates.iter().map(|one| one.name.as_str());
+    assert!(names.eq(["radar", "planner", "logger", "camera"]));
     assert_eq!(plan.timeout_ns, Some(10_000_000_000));
     assert!(plan.extensions);
     let wires: Vec<String> = plan
@@ -104,11 +100,11 @@ fn the_example_is_a_federation() {
         .iter()
         .map(|wire| {
             format!(
-                "{}.{}[{}] {}> {}.{}[{}] after {:?} {} #{}",
+                "{}.{}[{}] {} {}.{}[{}] after {:?} {} #{}",
                 wire.from.federate,
                 wire.from.port,
                 wire.from.channel,
-                if wire.physical { '~' } else { '-' },
+                if wire.physical { "~>" } else { "->" },
                 wire.to.federate,
                 wire.to.port,
                 wire.to.channel,

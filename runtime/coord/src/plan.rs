@@ -9,6 +9,10 @@ pub const FORMAT: &str = "v1";
 /// One federation, resolved: names are checked, multiports are expanded to channels, delays are nanoseconds.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
+#[expect(
+    clippy::struct_excessive_bools,
+    reason = "each is a key of the manifest, independent of the others"
+)]
 pub struct Plan {
     /// Always [`FORMAT`].
     pub ictus: String,
