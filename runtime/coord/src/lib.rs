@@ -1,6 +1,7 @@
 //! Federated coordination as state machines: wire codec, RTI, federate. Pure.
 
 pub mod auth;
+pub mod clock;
 pub mod describe;
 pub mod federate;
 pub mod measure;

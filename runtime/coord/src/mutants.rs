@@ -63,6 +63,18 @@ pub enum Mutant {
     TardyUncounted,
     /// Decentralized: the end of a lost sender's stream is taken for its regular end.
     LossAsEnd,
+    /// Clock: the bound does not grow with the age of what it rests on.
+    ClockBoundWithoutDrift,
+    /// Clock: an exchange that contradicts the earlier ones is thrown away, not they.
+    ClockStepIgnored,
+    /// Clock: the latest exchange is believed, not the fastest.
+    ClockUnfiltered,
+    /// Clock: the bound is that of the clock as it should be, not as it is while it slews.
+    ClockSlewNotInBound,
+    /// Clock: the bound assumes that both ways take equally long.
+    ClockAsymmetryForgotten,
+    /// Clock: a T1 that comes twice is answered twice.
+    ClockDuplicateTaken,
 }
 
 impl Mutant {
@@ -80,7 +92,7 @@ impl Mutant {
         )
     }
 
-    /// All of them.
+    /// Those of coordination.
     pub const ALL: &[Self] = &[
         Self::EimtNotStrict,
         Self::InTransitIgnored,
@@ -111,6 +123,16 @@ impl Mutant {
         Self::OrderIgnored,
         Self::TardyUncounted,
         Self::LossAsEnd,
+    ];
+
+    /// Those of clock synchronization, which has a simulation of its own.
+    pub const CLOCK: &[Self] = &[
+        Self::ClockBoundWithoutDrift,
+        Self::ClockStepIgnored,
+        Self::ClockUnfiltered,
+        Self::ClockSlewNotInBound,
+        Self::ClockAsymmetryForgotten,
+        Self::ClockDuplicateTaken,
     ];
 }
 

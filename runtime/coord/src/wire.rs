@@ -105,6 +105,8 @@ pub mod kind {
     pub const CLOCK_SYNC_T3: u8 = 20;
     /// CLOCK_SYNC_T4, RTI to federate.
     pub const CLOCK_SYNC_T4: u8 = 21;
+    /// CLOCK_SYNC_CODED_PROBE, RTI to federate, over UDP only.
+    pub const CLOCK_SYNC_CODED_PROBE: u8 = 22;
     /// PORT_ABSENT, federate to RTI to federate.
     pub const PORT_ABSENT: u8 = 23;
     /// NEIGHBOR_STRUCTURE, federate to RTI.

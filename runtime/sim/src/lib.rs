@@ -1,6 +1,7 @@
 //! Simulated network, clocks, hosts and faults with checkers; one seed drives all. Pure.
 
 pub mod clock;
+pub mod clocks;
 pub mod coverage;
 pub mod executor;
 pub mod network;

@@ -1,4 +1,5 @@
-//! `cargo sim --seeds N [--seed 0x51f3]... [--decentralized] [--dump] [--mutants]`: checks seeds, prints what they showed.
+//! `cargo sim --seeds N [--seed 0x51f3]... [--decentralized] [--dump] [--clocks N] [--clock 0x51f3]... [--mutants]`: checks
+//! seeds, prints what they showed.
 
 use std::io::{self, Write};
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -10,6 +11,8 @@ use ictus_sim::coverage::Coverage;
 use ictus_sim::observer::Violation;
 use ictus_sim::scenario::{Kind, Verdict, check_seed_logged, describe};
 
+mod clock_seeds;
+
 /// Threads that check seeds.
 const THREADS: u64 = 2;
 
@@ -20,6 +23,7 @@ struct Options {
     seeds: u64,
     first: u64,
     single: Vec<u64>,
+    clocks: clock_seeds::Options,
     mutants: bool,
     dump: bool,
     kind: Kind,
@@ -33,7 +37,8 @@ fn main() -> ExitCode {
             Ok(false) | Err(_) => ExitCode::FAILURE,
         },
         Err(words) => {
-            let usage = "cargo sim [--seeds N] [--from N] [--seed 0xN]... [--decentralized] [--dump] [--mutants]";
+            let usage = "cargo sim [--seeds N] [--from N] [--seed 0xN]... [--decentralized] [--dump] \
+                [--clocks N] [--clock 0xN]... [--mutants]";
             drop(writeln!(io::stderr(), "{words}\nusage: {usage}"));
             ExitCode::from(2)
         }
@@ -45,6 +50,7 @@ fn parse(arguments: impl Iterator<Item = String>) -> Result<Options, String> {
         seeds: 0,
         first: 1,
         single: Vec::new(),
+        clocks: clock_seeds::Options::default(),
         mutants: false,
         dump: false,
         kind: Kind::Centralized,
@@ -63,6 +69,8 @@ fn parse(arguments: impl Iterator<Item = String>) -> Result<Options, String> {
             "--seeds" => options.seeds = number()?,
             "--from" => options.first = number()?,
             "--seed" => options.single.push(number()?),
+            "--clocks" => options.clocks.seeds = number()?,
+            "--clock" => options.clocks.single.push(number()?),
             "--mutants" => options.mutants = true,
             "--dump" => options.dump = true,
             "--decentralized" => options.kind = Kind::Decentralized,
@@ -97,6 +105,7 @@ fn run(options: &Options, out: &mut impl Write) -> io::Result<bool> {
     if options.seeds > 0 {
         good &= run_seeds(options, out)?;
     }
+    good &= clock_seeds::run(&options.clocks, out)?;
     if options.mutants {
         good &= mutants::run(options, out)?;
     }

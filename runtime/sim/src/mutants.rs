@@ -1,6 +1,6 @@
 //! Every mutant, against the seeds until one catches it.
 
-use super::{Options, check};
+use super::{Options, check, clock_seeds};
 use ictus_coord::mutants::{Mutant, Mutants};
 use ictus_sim::scenario::Kind;
 use std::io::{self, Write};
@@ -15,6 +15,7 @@ pub(super) fn run(options: &Options, out: &mut impl Write) -> io::Result<bool> {
     } else {
         options.seeds
     };
+    let all: Vec<Mutant> = [Mutant::ALL, Mutant::CLOCK].concat();
     let quiet = std::panic::take_hook();
     std::panic::set_hook(Box::new(|_| {}));
     let next = AtomicU64::new(0);
@@ -22,7 +23,7 @@ pub(super) fn run(options: &Options, out: &mut impl Write) -> io::Result<bool> {
         let mut rows = Vec::new();
         loop {
             let index = usize::try_from(next.fetch_add(1, Ordering::Relaxed)).unwrap_or(0);
-            let Some(mutant) = Mutant::ALL.get(index) else {
+            let Some(mutant) = all.get(index) else {
                 return rows;
             };
             rows.push((index, hunt(*mutant, seeds)));
@@ -44,7 +45,7 @@ pub(super) fn run(options: &Options, out: &mut impl Write) -> io::Result<bool> {
     )?;
     let mut caught = 0;
     for (index, row) in &rows {
-        let mutant = Mutant::ALL[*index];
+        let mutant = all[*index];
         match row {
             Some((seed, words)) => {
                 caught += 1;
@@ -64,6 +65,9 @@ pub(super) fn run(options: &Options, out: &mut impl Write) -> io::Result<bool> {
 }
 
 fn hunt(mutant: Mutant, seeds: u64) -> Option<(u64, String)> {
+    if Mutant::CLOCK.contains(&mutant) {
+        return clock_seeds::hunt(mutant, seeds);
+    }
     (1..=seeds).find_map(|seed| {
         let kind = if mutant.is_of_time() {
             Kind::Decentralized
