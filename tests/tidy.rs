@@ -13,6 +13,7 @@ const ARROWS: &[(&str, &[&str])] = &[
     ("ictus-core", &[]),
     ("ictus-macros", &[]),
     ("ictus-coord", &["ictus-core"]),
+    ("ictus-clock", &["ictus-core", "ictus-coord"]),
     ("ictus-sim", &["ictus-core", "ictus-coord"]),
     ("ictus-metrics", &["ictus-core"]),
     (
@@ -20,6 +21,7 @@ const ARROWS: &[(&str, &[&str])] = &[
         &[
             "ictus-core",
             "ictus-coord",
+            "ictus-clock",
             "ictus-macros",
             "ictus-metrics",
             "ictus-sim",
@@ -27,7 +29,7 @@ const ARROWS: &[(&str, &[&str])] = &[
     ),
     (
         "ictus-rti",
-        &["ictus-core", "ictus-coord", "ictus-metrics"],
+        &["ictus-core", "ictus-coord", "ictus-clock", "ictus-metrics"],
     ),
     ("ictus-deploy", &["ictus-core", "ictus-coord"]),
     (
@@ -35,6 +37,7 @@ const ARROWS: &[(&str, &[&str])] = &[
         &[
             "ictus-core",
             "ictus-coord",
+            "ictus-clock",
             "ictus-deploy",
             "ictus-metrics",
             "ictus-rti",

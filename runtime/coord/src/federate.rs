@@ -24,6 +24,7 @@ mod peers;
 mod stop;
 mod timed;
 
+use crate::clock::Interval;
 use crate::measure::{LagNews, Measures};
 use crate::mutants::Mutant;
 use crate::payload::{FederateExecutor, PayloadError};
@@ -73,8 +74,8 @@ pub enum Poll {
 pub enum FederateEvent {
     /// The RTI accepted the join.
     Joined,
-    /// The clock is off by this much: add it to every later reading.
-    ClockOffset(Duration),
+    /// The clock is off by so much: before anything else add what is in its middle to every later reading.
+    ClockOffset(Interval),
     /// The start tag is agreed.
     Started(Tag),
     /// The first tag is completed.

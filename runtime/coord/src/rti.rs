@@ -32,11 +32,12 @@
 //! reply that is late kills nobody as long as all are alive.
 
 use std::collections::{BTreeSet, VecDeque};
-use std::net::{IpAddr, Ipv4Addr};
+use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 
 use ictus_core::{Duration, PhysicalTime, Tag};
 
 use crate::auth::Nonce;
+use crate::clock::{Prober, Transmit};
 use crate::mutants::Mutants;
 use crate::plan::Wire;
 use crate::topology::{FederateId, Topology};
@@ -73,6 +74,8 @@ pub struct RtiConfig {
     /// The federates whose loss stops nobody: nothing comes from them any more, as if they had resigned. The exit code is 1
     /// all the same, and before the start there is no going on without them.
     pub continue_without: BTreeSet<u16>,
+    /// The time between two exchanges over UDP with a federate that has a port for them; absent: none.
+    pub clock_period: Option<Duration>,
     /// The layout of ADDRESS_QUERY.
     pub wire: Wire,
     /// Whether DNETs are sent.
@@ -113,6 +116,7 @@ impl RtiConfig {
             clock_exchanges: 0,
             authentication: false,
             continue_without: BTreeSet::new(),
+            clock_period: None,
             wire: Wire::V0_12,
             dnet: true,
             start_multiple: None,
@@ -270,6 +274,7 @@ pub struct Rti {
     /// Outputs that changed since they were last polled.
     outputs: VecDeque<ConnectionId>,
     events: VecDeque<RtiEvent>,
+    prober: Option<Prober>,
     /// Messages that a mutant writes after the grants.
     held: Vec<(FederateId, Vec<u8>)>,
 }
@@ -335,6 +340,8 @@ struct Member {
     last_word: PhysicalTime,
     /// CAPABILITIES, once it has sent them.
     capabilities: Option<u32>,
+    /// Where it answers probes.
+    probed_at: Option<SocketAddr>,
     neighbors: NeighborStructure,
     /// Whether its last message was ADDRESS_QUERY.
     queried: bool,
@@ -399,6 +406,9 @@ impl Rti {
             round_trip: Duration::ZERO,
             outputs: VecDeque::new(),
             events: VecDeque::new(),
+            prober: config
+                .clock_period
+                .map(|period| Prober::new(config.federates, period)),
             held: Vec::new(),
             config,
         }
@@ -545,6 +555,25 @@ impl Rti {
         }
     }
 
+    /// Takes a datagram that came at `arrived` or before.
+    pub fn receive_probe(&mut self, from: SocketAddr, bytes: &[u8], arrived: PhysicalTime) {
+        if let Some(prober) = &mut self.prober {
+            prober.receive(from, bytes, arrived);
+        }
+    }
+
+    /// The next datagram to send, at once; `now` is a reading of the clock just before.
+    #[must_use]
+    pub fn poll_probe(&mut self, now: PhysicalTime) -> Option<Transmit> {
+        self.prober.as_mut()?.poll_transmit(now)
+    }
+
+    /// The prober, while clocks are compared continuously.
+    #[must_use]
+    pub const fn prober(&self) -> Option<&Prober> {
+        self.prober.as_ref()
+    }
+
     fn advance_to(&mut self, now: PhysicalTime) {
         self.now = self.now.max(now);
     }
@@ -623,6 +652,7 @@ impl Member {
             connection: None,
             last_word: PhysicalTime::NEVER,
             capabilities: None,
+            probed_at: None,
             neighbors: NeighborStructure {
                 upstream: Vec::new(),
                 downstream: Vec::new(),

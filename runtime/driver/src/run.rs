@@ -518,7 +518,10 @@ impl Runner<'_> {
             let federate = self.name.to_owned();
             match event {
                 FederateEvent::Joined => self.status.say(&FederateStatus::Joined { federate }),
-                FederateEvent::ClockOffset(offset) => self.clock.correct(offset),
+                FederateEvent::ClockOffset(interval) => {
+                    let offset = interval.middle(self.clock.now());
+                    self.clock.correct(offset);
+                }
                 FederateEvent::Started(start) => {
                     self.start = start;
                     self.bodies.start(start);

@@ -44,7 +44,8 @@ impl Interval {
             },
             drift_bound_ppb: DRIFT_BOUND_PPB,
         };
-        interval.is_possible(exchange.t3).then_some(interval)
+        let possible = exchange.is_plausible() && interval.is_possible(exchange.t3);
+        possible.then_some(interval)
     }
 
     /// What some exchanges say together; `None` when there is none, or they contradict one another.

@@ -46,7 +46,10 @@ struct Target {
 #[derive(Clone, Copy, Debug)]
 enum State {
     /// The next exchange begins then.
-    Resting { until: PhysicalTime },
+    Resting {
+        since: PhysicalTime,
+        until: PhysicalTime,
+    },
     /// T1 is about to be sent.
     Beginning,
     /// T1 was sent at `t1`.
@@ -91,10 +94,11 @@ impl Prober {
         self.strangers
     }
 
-    /// From now on probes a federate at `address`.
-    pub fn begin(&mut self, now: PhysicalTime, federate: FederateId, address: SocketAddr) {
+    /// From `first` on probes a federate at `address`.
+    pub fn begin(&mut self, first: PhysicalTime, federate: FederateId, address: SocketAddr) {
         if let Some(target) = self.targets.get_mut(federate.index()) {
-            let state = State::Resting { until: now };
+            let (since, until) = (PhysicalTime::NEVER, first);
+            let state = State::Resting { since, until };
             let echoes = false;
             *target = Some(Target {
                 address,
@@ -115,7 +119,7 @@ impl Prober {
     #[must_use]
     pub fn poll_timeout(&self) -> Option<PhysicalTime> {
         let due = |target: &Target| match target.state {
-            State::Resting { until } => Some(until),
+            State::Resting { until, .. } => Some(until),
             State::Waiting { t1 } => Some(t1 + self.patience(target)),
             State::Beginning => None,
         };
@@ -129,7 +133,7 @@ impl Prober {
                 continue;
             };
             let begins = match target.state {
-                State::Resting { until } => until <= now || until > now + self.period,
+                State::Resting { since, until } => until <= now || since > now,
                 State::Waiting { t1 } => {
                     let over = t1 + self.patience(&target) <= now || t1 > now;
                     self.unanswered += u64::from(over);
@@ -159,6 +163,7 @@ impl Prober {
         target.echoes = echoes;
         // Next to T1, not to now: the rhythm does not drift.
         target.state = State::Resting {
+            since: arrived,
             until: t1 + self.period,
         };
         let t4 = Outgoing::T4 {

@@ -3,12 +3,10 @@
 use super::link::Link;
 use super::{Federate, FederateEvent, Incoming, Outcome, Poll, ProtocolError};
 use crate::auth::{Nonce, Proof};
+use crate::clock::{Exchange, Interval};
 use crate::payload::FederateExecutor;
 use crate::wire::{NO_CLOCK_SYNC, RejectReason, TaggedMessage, ToFederate, ToRti, capability};
 use ictus_core::{Duration, PhysicalTime, Tag};
-
-/// Round trips that scatter more than this say nothing: no correction is made. Source: section 4 of the wire document.
-const GUARD_BAND: Duration = Duration::from_micros(100);
 
 /// A step of joining that takes longer is not answered at all: joins are answered one by one, clocks compared at once.
 pub(super) const ANSWER_MAX: Duration = Duration::from_secs(60);
@@ -58,39 +56,11 @@ impl Phase {
 }
 
 /// Clock exchanges over TCP: T1 from the RTI, T3 to it, T4 from it.
-#[derive(Debug)]
+#[derive(Debug, Default)]
 pub(super) struct Exchanges {
     wanted: u32,
     sent_at: Option<(PhysicalTime, PhysicalTime)>,
-    errors: Vec<i64>,
-    round_trips: Vec<i64>,
-}
-
-impl Exchanges {
-    fn new(wanted: u32) -> Self {
-        Self {
-            wanted,
-            sent_at: None,
-            errors: Vec::new(),
-            round_trips: Vec::new(),
-        }
-    }
-
-    /// The mean error, or zero when the round trips scatter too much.
-    fn offset(&self) -> Duration {
-        let count = i64::try_from(self.errors.len()).unwrap_or(i64::MAX).max(1);
-        let mean = |values: &[i64]| values.iter().sum::<i64>() / count;
-        let mean_trip = mean(&self.round_trips);
-        let squares = self
-            .round_trips
-            .iter()
-            .map(|t| i128::from(t - mean_trip).pow(2));
-        let variance = squares.sum::<i128>() / i128::from(count);
-        if variance >= i128::from(GUARD_BAND.as_nanos()).pow(2) {
-            return Duration::ZERO;
-        }
-        Duration::from_nanos(mean(&self.errors))
-    }
+    done: Vec<Exchange>,
 }
 
 impl Federate {
@@ -238,7 +208,7 @@ impl Federate {
         link.say(&ToRti::NeighborStructure(link.neighbors()));
         let exchanges = link.config.clock_exchanges;
         link.say(&ToRti::UdpPort(if exchanges.is_some() {
-            0
+            link.config.clock_port
         } else {
             NO_CLOCK_SYNC
         }));
@@ -254,7 +224,10 @@ impl Federate {
         }
         match exchanges {
             Some(wanted) if wanted > 0 => {
-                self.phase = Phase::Synchronizing(Exchanges::new(wanted));
+                self.phase = Phase::Synchronizing(Exchanges {
+                    wanted,
+                    ..Exchanges::default()
+                });
             }
             Some(_) | None => self.advertise(),
         }
@@ -277,18 +250,16 @@ impl Federate {
         let Some((t1, t2)) = exchanges.sent_at.take() else {
             return;
         };
-        // T3 is written in the same call that takes T1, so t3 = t2 and nothing is subtracted from the round trip.
-        let round_trip = t4.since(t1).as_nanos();
-        exchanges
-            .errors
-            .push((round_trip / 2).saturating_sub(t2.since(t1).as_nanos()));
-        exchanges.round_trips.push(round_trip);
-        if exchanges.errors.len() < exchanges.wanted as usize {
+        // T3 is written later than this, and only that matters: LF takes the mean of the errors, this one what is certain.
+        let t3 = t2;
+        exchanges.done.push(Exchange { t1, t2, t3, t4 });
+        if exchanges.done.len() < exchanges.wanted as usize {
             return;
         }
         // Its own time is proposed at the next poll, when the driver has corrected the clock.
-        let offset = exchanges.offset();
-        self.events.push_back(FederateEvent::ClockOffset(offset));
+        if let Some(interval) = Interval::of_all(&exchanges.done) {
+            self.events.push_back(FederateEvent::ClockOffset(interval));
+        }
         self.advertise();
     }
 

@@ -41,6 +41,8 @@ pub struct LinkConfig {
     pub in_cycle: bool,
     /// Whether the clock is compared with the RTI's while joining, and with how many exchanges.
     pub clock_exchanges: Option<u32>,
+    /// The UDP port at which probes are answered; 0: none are wanted.
+    pub clock_port: u16,
     /// Whether the RTI is ours.
     pub extensions: bool,
     /// How far a federate without upstreams may run ahead of what its downstreams have confirmed.
@@ -111,6 +113,7 @@ impl LinkConfig {
             in_cycle: topology.in_zero_delay_cycle(me),
             clock_exchanges: matches!(plan.clock.sync, ClockSync::Init | ClockSync::On)
                 .then_some(plan.clock.trials),
+            clock_port: 0,
             extensions: plan.extensions,
             max_lead: plan.max_lead_ns.map(Duration::from_nanos),
             fast: plan.fast,

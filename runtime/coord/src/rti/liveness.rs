@@ -5,6 +5,7 @@ use ictus_core::{Duration, PhysicalTime, Tag};
 use super::grant::{LostRule, Presence, promise_over};
 use super::stop::Stop;
 use super::{Closing, ConnectionId, Link, Phase, Rti, RtiEvent, Stage};
+use crate::clock::Prober;
 use crate::mutants::Mutant;
 use crate::report::exit;
 use crate::topology::FederateId;
@@ -20,6 +21,9 @@ impl Rti {
     /// Acts on the deadlines that have passed; [`Rti::drain`] comes next.
     pub fn handle_timeout(&mut self, now: PhysicalTime) {
         self.advance_to(now);
+        if let Some(prober) = &mut self.prober {
+            prober.handle_timeout(now);
+        }
         for index in 0..self.connections.len() {
             self.check_connection(ConnectionId(index));
         }
@@ -61,6 +65,7 @@ impl Rti {
             })
             .chain(self.stop_deadline())
             .chain(self.grace_deadline())
+            .chain(self.prober.as_ref().and_then(Prober::poll_timeout))
             .min()
     }
 
@@ -278,6 +283,9 @@ impl Rti {
     }
 
     fn detach(&mut self, federate: FederateId, presence: Presence) {
+        if let Some(prober) = &mut self.prober {
+            prober.end(federate);
+        }
         self.close_member(federate, Closing::AfterFlush);
         self.standings[federate.index()].presence = presence;
         let member = &mut self.members[federate.index()];

@@ -1,5 +1,7 @@
 //! Joining: who a connection is, clock exchanges, and the start time.
 
+use std::net::SocketAddr;
+
 use ictus_core::{Delay, Duration, LogicalTime, PhysicalTime, Tag};
 
 use super::{ConnectionId, Hello, Link, Member, Phase, Rti, RtiEvent, Stage};
@@ -188,10 +190,26 @@ impl Rti {
 
     fn take_udp_port(&mut self, federate: FederateId, port: u16) {
         self.events.push_back(RtiEvent::Joined { federate });
+        self.members[federate.index()].probed_at = self.probe_address(federate, port);
         if self.config.clock_exchanges == 0 || port == NO_CLOCK_SYNC {
             self.members[federate.index()].stage = Stage::Synchronized { exchanged: false };
         } else {
             self.begin_exchange(federate, self.config.clock_exchanges - 1);
+        }
+    }
+
+    /// Where a federate with this UDP_PORT answers probes.
+    fn probe_address(&self, federate: FederateId, port: u16) -> Option<SocketAddr> {
+        let connection = self.members[federate.index()].connection?;
+        let peer: SocketAddr = self.connections[connection.0].peer.parse().ok()?;
+        (port != 0 && port != NO_CLOCK_SYNC).then(|| SocketAddr::new(peer.ip(), port))
+    }
+
+    /// From `first` on compares clocks with a federate that wants that.
+    fn begin_probing(&mut self, first: PhysicalTime, federate: FederateId) {
+        let member = &mut self.members[federate.index()];
+        if let (Some(prober), Some(address)) = (&mut self.prober, member.probed_at.take()) {
+            prober.begin(first, federate, address);
         }
     }
 
@@ -210,6 +228,10 @@ impl Rti {
             Some(left) => self.begin_exchange(federate, left),
             None => {
                 self.members[federate.index()].stage = Stage::Synchronized { exchanged: true };
+                // LF's federates listen for probes from the start time on.
+                if self.members[federate.index()].capabilities.is_some() {
+                    self.begin_probing(self.now, federate);
+                }
             }
         }
     }
@@ -249,6 +271,7 @@ impl Rti {
         for federate in self.federates() {
             self.members[federate.index()].stage = Stage::Running;
             self.send(federate, &ToFederate::Timestamp(start));
+            self.begin_probing(start, federate);
         }
         self.refuse_strangers();
     }

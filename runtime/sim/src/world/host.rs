@@ -172,11 +172,7 @@ impl<E: SimulatedExecutor> Host<E> {
     /// Whether an event got a later tag than any promise made so far can ask for.
     fn deferred_too_far(&self, action: ActionId, tag: Tag, last: Option<Tag>, now: i64) -> bool {
         let program = self.federate.timeline().program();
-        let ActionKind::Physical {
-            min_delay,
-            spacing,
-        } = program.actions()[action.index()]
-        else {
+        let ActionKind::Physical { min_delay, spacing } = program.actions()[action.index()] else {
             return false;
         };
         let start = self.federate.timeline().start_tag().time;
@@ -463,7 +459,9 @@ impl<E: SimulatedExecutor> World<E> {
     fn take_events(&mut self, federate: usize) {
         while let Some(event) = self.hosts[federate].federate.poll_event() {
             match event {
-                FederateEvent::ClockOffset(offset) => {
+                FederateEvent::ClockOffset(interval) => {
+                    let base = self.hosts[federate].clock.reading(self.now);
+                    let offset = interval.middle(base);
                     self.hosts[federate].clock.correct(offset);
                     if offset != Duration::ZERO {
                         self.observer.coverage.hit(Feature::ClockOffset);

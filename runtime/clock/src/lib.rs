@@ -1,0 +1,8 @@
+//! The host's clocks, for federates, RTI and daemon alike: readings ([`HostClock`]), who disciplines them
+//! ([`discipline`]), and a UDP socket that knows when its datagrams came ([`ProbeSocket`]).
+
+mod host;
+mod socket;
+
+pub use host::{HostClock, Skew, StepWatch};
+pub use socket::{Arrival, ProbeSocket, Stamps};

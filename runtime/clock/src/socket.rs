@@ -1,0 +1,204 @@
+//! A UDP socket that knows when its datagrams came.
+
+use std::io::{self, IoSliceMut};
+use std::net::{IpAddr, SocketAddr, UdpSocket};
+use std::os::fd::{AsFd, AsRawFd, BorrowedFd};
+
+use ictus_coord::clock::LONGEST;
+use ictus_core::{Duration, PhysicalTime};
+use nix::sys::socket::sockopt::Timestamping;
+use nix::sys::socket::{
+    ControlMessageOwned, MsgFlags, SockaddrStorage, TimestampingFlag, Timestamps, recvmsg,
+    setsockopt,
+};
+
+use crate::host::{HostClock, system};
+
+/// A datagram that waited longer for its reader has a stamp from before a step.
+const OLDEST: i64 = 10_000_000_000;
+
+/// Who says when a datagram came.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Stamps {
+    /// The kernel, when it took it from the network (SO_TIMESTAMPING, software).
+    Kernel,
+    /// The reader, when it has it.
+    Reader,
+}
+
+/// A non-blocking UDP socket for probes.
+///
+/// With [`Stamps::Kernel`] the time a datagram waits for its reader to be scheduled, tens of microseconds on an idle machine and
+/// milliseconds on a busy one, counts no longer as time on its way. When it was *sent* is read by the sender just before:
+/// T1 says so in itself, before it leaves, and what T3 does alike keeps both ways alike.
+#[derive(Debug)]
+pub struct ProbeSocket {
+    socket: UdpSocket,
+    stamps: Stamps,
+}
+
+/// A datagram.
+#[derive(Clone, Copy, Debug)]
+pub struct Arrival {
+    /// Who sent it.
+    pub from: SocketAddr,
+    bytes: [u8; LONGEST + 1],
+    length: usize,
+    /// How long before it was read it came.
+    pub waited: Duration,
+}
+
+impl Arrival {
+    /// What is in it, the first 12 bytes at most: no probe is longer than 11.
+    #[must_use]
+    pub fn bytes(&self) -> &[u8] {
+        &self.bytes[..self.length]
+    }
+
+    /// When it came, or a little later, by a clock that is read now.
+    #[must_use]
+    pub fn came(&self, clock: &HostClock) -> PhysicalTime {
+        clock.now() + -self.waited
+    }
+}
+
+impl ProbeSocket {
+    /// Opens a socket; port 0: the system chooses one. Where the kernel has no stamps, the reader's are taken.
+    ///
+    /// # Errors
+    ///
+    /// When the address cannot be used.
+    pub fn bind(address: IpAddr, port: u16, wanted: Stamps) -> io::Result<Self> {
+        let socket = UdpSocket::bind((address, port))?;
+        socket.set_nonblocking(true)?;
+        let flags = TimestampingFlag::SOF_TIMESTAMPING_RX_SOFTWARE
+            | TimestampingFlag::SOF_TIMESTAMPING_SOFTWARE;
+        let stamps = match wanted {
+            Stamps::Kernel if setsockopt(&socket, Timestamping, &flags).is_ok() => Stamps::Kernel,
+            Stamps::Kernel | Stamps::Reader => Stamps::Reader,
+        };
+        Ok(Self { socket, stamps })
+    }
+
+    /// Who says when a datagram came.
+    #[must_use]
+    pub const fn stamps(&self) -> Stamps {
+        self.stamps
+    }
+
+    /// The port.
+    ///
+    /// # Errors
+    ///
+    /// When the system does not say it.
+    pub fn port(&self) -> io::Result<u16> {
+        self.socket.local_addr().map(|address| address.port())
+    }
+
+    /// Sends a datagram. One that cannot be sent is as good as lost on its way.
+    pub fn send(&self, to: SocketAddr, bytes: &[u8]) {
+        let _lost = self.socket.send_to(bytes, to);
+    }
+
+    /// The next datagram; `None` when there is none.
+    ///
+    /// # Errors
+    ///
+    /// When the socket fails for good; errors of single datagrams are passed over.
+    pub fn receive(&self) -> io::Result<Option<Arrival>> {
+        loop {
+            match self.receive_one() {
+                Ok(Some(arrival)) => return Ok(Some(arrival)),
+                Ok(None) => {}
+                Err(error) => match error.kind() {
+                    io::ErrorKind::WouldBlock => return Ok(None),
+                    // A peer that is gone refuses, by ICMP, what was sent before.
+                    io::ErrorKind::Interrupted | io::ErrorKind::ConnectionRefused => {}
+                    _ => return Err(error),
+                },
+            }
+        }
+    }
+
+    /// `None`: it came from nowhere.
+    fn receive_one(&self) -> io::Result<Option<Arrival>> {
+        let mut bytes = [0; LONGEST + 1];
+        let mut parts = [IoSliceMut::new(&mut bytes)];
+        let mut control = nix::cmsg_space!(Timestamps);
+        let message = recvmsg::<SockaddrStorage>(
+            self.socket.as_raw_fd(),
+            &mut parts,
+            Some(&mut control),
+            MsgFlags::MSG_DONTWAIT,
+        )?;
+        let read_at = system();
+        let length = message.bytes;
+        let from = message.address.as_ref().and_then(address);
+        let stamp = message.cmsgs().ok().and_then(|mut messages| {
+            messages.find_map(|message| match message {
+                ControlMessageOwned::ScmTimestampsns(stamps) => Some(stamps.system),
+                _ => None,
+            })
+        });
+        let waited = stamp.map_or(0, |stamp| {
+            let stamp = stamp.tv_sec() * 1_000_000_000 + stamp.tv_nsec();
+            read_at.saturating_sub(stamp)
+        });
+        let waited = if (0..OLDEST).contains(&waited) {
+            waited
+        } else {
+            0
+        };
+        Ok(from.map(|from| Arrival {
+            from,
+            bytes,
+            length,
+            waited: Duration::from_nanos(waited),
+        }))
+    }
+}
+
+impl AsFd for ProbeSocket {
+    fn as_fd(&self) -> BorrowedFd<'_> {
+        self.socket.as_fd()
+    }
+}
+
+fn address(storage: &SockaddrStorage) -> Option<SocketAddr> {
+    if let Some(v4) = storage.as_sockaddr_in() {
+        return Some(SocketAddr::new(v4.ip().into(), v4.port()));
+    }
+    let v6 = storage.as_sockaddr_in6()?;
+    Some(SocketAddr::new(v6.ip().into(), v6.port()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::net::Ipv4Addr;
+
+    #[test]
+    fn the_kernel_knows_how_long_a_datagram_has_waited() {
+        let local = IpAddr::V4(Ipv4Addr::LOCALHOST);
+        let bind = |stamps| ProbeSocket::bind(local, 0, stamps).unwrap();
+        let (sender, reader) = (bind(Stamps::Reader), bind(Stamps::Kernel));
+        assert!(reader.receive().unwrap().is_none());
+        let to = SocketAddr::new(local, reader.port().unwrap());
+        let clock = HostClock::raw();
+        let before = clock.now();
+        sender.send(to, &[7; 20]);
+        let sent = clock.now();
+        while clock.now() < sent + Duration::from_millis(3) {}
+        let arrival = reader.receive().unwrap().unwrap();
+        assert_eq!(arrival.bytes(), [7; LONGEST + 1], "cut, and so no probe");
+        assert_eq!(arrival.from.port(), sender.port().unwrap());
+        if reader.stamps() == Stamps::Kernel {
+            assert!(
+                arrival.waited >= Duration::from_millis(3),
+                "{}",
+                arrival.waited
+            );
+        }
+        assert!(arrival.came(&clock) >= before);
+    }
+}
