@@ -480,7 +480,11 @@ impl Runner<'_> {
 
     #[cold]
     fn fire_watchdogs(&mut self, now: PhysicalTime) {
-        if self.bodies.fire_watchdogs(now).stop {
+        let fired = self.bodies.fire_watchdogs(now);
+        for _ in 0..fired.count {
+            self.federate.measures_mut().watchdog_fired();
+        }
+        if fired.stop {
             self.federate.request_stop(now);
         }
         if self.bodies.fault().is_some() {
