@@ -23,6 +23,8 @@ use crate::host::Host;
 
 /// Connections at a time on one address; further ones wait.
 const CONNECTIONS_MAX: usize = 16;
+/// How long a connection may take to say what it wants.
+const REQUEST_MAX: Duration = Duration::from_secs(2);
 /// How long one connection may last: its one request, and a slow reader of the answer.
 const CONNECTION_MAX: Duration = Duration::from_secs(10);
 /// How long to wait before another connection is tried when the system is out of descriptors.
@@ -126,7 +128,10 @@ async fn converse(stream: TcpStream, host: Host) {
         async move { Ok::<_, Infallible>(answer(&request, &host).await) }
     });
     let mut server = http1::Builder::new();
-    server.timer(TokioTimer::new()).keep_alive(false);
+    server
+        .timer(TokioTimer::new())
+        .header_read_timeout(REQUEST_MAX)
+        .keep_alive(false);
     let connection = server.serve_connection(TokioIo::new(stream), service);
     if let Err(error) = connection.await {
         tracing::debug!(%error, "a scrape broke off");

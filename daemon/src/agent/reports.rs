@@ -221,8 +221,8 @@ proptest! {
         let read = ictus_metrics::Page::parse(&page);
         prop_assert!(read.is_ok(), "{:?}\n{}", read, page);
         // It still works.
-        world.ends(super::A, OK);
-        world.ends(super::B, OK);
+        world.ends(A, OK);
+        world.ends(B, OK);
         world.ends(MemberId::Rti, OK);
         prop_assert!(world.agent.outcome().is_some());
     }

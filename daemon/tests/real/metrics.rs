@@ -5,7 +5,7 @@ use ictus_metrics::Page;
 use ictusd::api::{ErrorCode, Event, StartRequest};
 use serde_json::Value;
 
-use crate::world::{BOUND, Started, World, federation, next, outcome};
+use crate::world::{BOUND, Process, Started, World, federation, next, outcome};
 
 /// A federate `a`, and `b` that says what it measured of `a`; metrics over TCP on any port.
 fn request() -> StartRequest {
@@ -22,7 +22,7 @@ async fn start(world: &World) -> Started {
     while !healthy || late.is_none() {
         match next(&mut stream).await.event {
             Event::Started { member, pid, .. } => {
-                processes.insert(member, crate::world::Process::of(pid));
+                processes.insert(member, Process::of(pid));
             }
             Event::Healthy => healthy = true,
             Event::StpViolation {
@@ -81,7 +81,7 @@ async fn address(world: &World) -> SocketAddr {
     view.metrics.unwrap()
 }
 
-#[tokio::test(flavor = "multi_thread")]
+#[tokio::test]
 async fn metrics_and_measures_are_served_until_the_federation_is_taken_down() {
     let world = World::new().await;
     let mut pair = start(&world).await;
@@ -137,7 +137,7 @@ async fn metrics_and_measures_are_served_until_the_federation_is_taken_down() {
     );
 }
 
-#[tokio::test(flavor = "multi_thread")]
+#[tokio::test]
 async fn counters_survive_the_daemon() {
     let mut world = World::new().await;
     let _pair = start(&world).await;
@@ -149,21 +149,20 @@ async fn counters_survive_the_daemon() {
     assert_measured(&Page::parse(scraped.split_once("\r\n\r\n").unwrap().1).unwrap());
 }
 
-#[tokio::test(flavor = "multi_thread")]
+#[tokio::test]
 async fn what_was_measured_before_an_end_without_a_daemon_is_known() {
     let mut world = World::new().await;
     let pair = start(&world).await;
     let measures = world.client.measures("pair").await.unwrap();
+    let supervisor = &world.record("pair")["members"]["b"]["supervisor"]["pid"];
+    let supervisor = Process::of(u32::try_from(supervisor.as_u64().unwrap()).unwrap());
     world.kill_daemon();
     pair.processes["b"].kill();
     for process in pair.processes.values() {
         process.assert_ends();
     }
     // Its supervisor has written the record before it ends.
-    let record = world.record("pair");
-    let supervisor = &record["members"]["b"]["supervisor"]["pid"];
-    let supervisor = u32::try_from(supervisor.as_u64().unwrap()).unwrap();
-    crate::world::Process::of(supervisor).assert_ends();
+    supervisor.assert_ends();
     let record = std::fs::read(world.directory("pair").join("exit/b.json")).unwrap();
     let record: Value = serde_json::from_slice(&record).unwrap();
     assert!(!record["reports"].as_array().unwrap().is_empty());
@@ -176,7 +175,7 @@ async fn what_was_measured_before_an_end_without_a_daemon_is_known() {
     assert_eq!(page.value("ictus_federate_exits_total", &killed), Some(1.0));
 }
 
-#[tokio::test(flavor = "multi_thread")]
+#[tokio::test]
 async fn an_address_in_use_refuses_the_start_and_one_address_serves_several_federations() {
     let world = World::new().await;
     let taken = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
@@ -201,7 +200,7 @@ async fn an_address_in_use_refuses_the_start_and_one_address_serves_several_fede
     assert!(TcpStream::connect(address).is_err());
 }
 
-#[tokio::test(flavor = "multi_thread")]
+#[tokio::test]
 async fn silent_connections_do_not_keep_others_out_for_ever() {
     let world = World::new().await;
     let _pair = start(&world).await;

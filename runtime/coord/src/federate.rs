@@ -261,6 +261,8 @@ pub struct Federate {
     physical_delay: Option<Duration>,
     stop: stop::Stop,
     measures: Measures,
+    /// Since when a grant has been missing, under centralized coordination.
+    asked: Option<PhysicalTime>,
     /// Receivers of messages that were written since the last poll, with the logical time at which they were.
     launches: Vec<(u16, LogicalTime)>,
     /// Everything that had come when the clock showed this has been received.
@@ -300,6 +302,7 @@ impl Federate {
             counters: Counters::default(),
             stop: stop::Stop::default(),
             measures: link.as_ref().map_or_else(Measures::default, Link::measures),
+            asked: None,
             launches: Vec::new(),
             looked_at: PhysicalTime::NEVER,
             now: PhysicalTime::NEVER,
@@ -579,6 +582,7 @@ impl Federate {
             };
             let permission = link.permit(now, next, promise);
             if let Permission::Wait(until) = permission {
+                self.asked.get_or_insert(now);
                 self.counters.skipped_announcements = link.skipped();
                 self.counters.held_back = link.held_back();
                 return Err(Poll::Wait(until));
@@ -587,8 +591,18 @@ impl Federate {
         if next == Tag::FOREVER {
             return self.starve().ok_or(Poll::Wait(None));
         }
+        if let Some(asked) = self.asked.take() {
+            self.note_granted(now, asked, next);
+        }
         self.wait_until_due(now, next)?;
         Ok(next)
+    }
+
+    /// Notes how long a tag that was asked for waited for nothing but its grant.
+    fn note_granted(&mut self, now: PhysicalTime, asked: PhysicalTime, tag: Tag) {
+        let due = tag.time.as_physical();
+        let ready = if self.config.fast { asked } else { asked.max(due) };
+        self.measures.grant_wait(now.since(ready));
     }
 
     #[inline]

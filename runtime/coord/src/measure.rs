@@ -64,7 +64,7 @@ pub struct Own {
     /// Physical minus logical time when a tag is begun.
     #[serde(skip_serializing_if = "Histogram::is_empty")]
     pub tag_lag: Histogram,
-    /// How long tags waited for their grant after all else was ready.
+    /// How long tags that were not granted at once waited for nothing but their grant.
     #[serde(skip_serializing_if = "Histogram::is_empty")]
     pub grant_wait: Histogram,
     /// By how much deadlines were missed.
@@ -177,7 +177,7 @@ impl Measures {
         news
     }
 
-    /// A tag waited `span` for its grant.
+    /// A tag that was not granted at once waited `span` for nothing but its grant.
     pub fn grant_wait(&mut self, span: Duration) {
         self.own.grant_wait.record(span);
     }

@@ -585,6 +585,11 @@ impl Runner<'_> {
         }
         self.reported_at = now;
         self.bodies.flush_observed();
+        self.report();
+    }
+
+    /// Says how far the federate is and what it measured, as far as there is room for it.
+    fn report(&mut self) {
         if self.start == Tag::NEVER {
             return;
         }
@@ -600,6 +605,8 @@ impl Runner<'_> {
             received: counters.received,
             deadlines_missed: bodies.deadlines_missed,
         });
+        self.status
+            .say_measures(self.name, self.federate.measures());
     }
 
     /// After the last tag: the last bytes, the trace's end, the last status line, the exit code.
@@ -611,6 +618,7 @@ impl Runner<'_> {
             .note_end(at, &reason)
             .map_err(RunError::Observe)?;
         self.drain()?;
+        self.report();
         let started = self.start != Tag::NEVER;
         self.status.say(&FederateStatus::Ended {
             federate: self.name.to_owned(),

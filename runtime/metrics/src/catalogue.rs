@@ -230,7 +230,7 @@ pub const GRANT_WAIT: Metric = Metric {
     kind: Kind::Histogram,
     unit: Unit::Seconds,
     labels: &["federation", "federate"],
-    help: "How long tags waited for the RTI's grant.",
+    help: "How long tags that were not granted at once waited for nothing but the RTI's grant.",
 };
 /// Messages sent to a federate.
 pub const MESSAGES_SENT: Metric = Metric {
