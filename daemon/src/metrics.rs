@@ -3,12 +3,13 @@
 use ictus_coord::measure::{Downstream, Histogram, Own, Upstream};
 use ictus_coord::plan::{Coordination, Plan};
 use ictus_coord::report::ClockStatus;
+use ictus_coord::stp::{self, Link};
 use ictus_metrics::catalogue::{
     CLOCK_ERROR_BOUND, CLOCK_ERROR_LIMIT, CLOCK_FREQUENCY_ERROR, CLOCK_OFFSET, CLOCK_PROBES,
     CLOCK_STEPS, CLOCK_SYNCHRONIZED, DAEMON_BUILD_INFO, DEADLINE_LATENESS, DEADLINE_MISSES,
     FALLING_BEHIND, FEDERATE_EXITS, FEDERATE_RESTARTS, FEDERATE_STATE, FEDERATE_UP, FELL_BEHIND,
     GRANT_WAIT, LAUNCH_LAG, MESSAGE_BYTES, MESSAGE_LATENCY, MESSAGES_RECEIVED, MESSAGES_SENT,
-    REACTIONS_EXECUTED, RTI_FEDERATES, RTI_UP, STP_OFFSET, STP_SLACK, STP_VIOLATION_LATENESS,
+    REACTIONS_EXECUTED, RTI_FEDERATES, RTI_UP, STP_OFFSET, STP_OFFSET_REQUIRED, STP_SLACK, STP_VIOLATION_LATENESS,
     STP_VIOLATIONS, TAG_LAG, TAGS_COMPLETED, WATCHDOGS_FIRED,
 };
 use ictus_metrics::{Metric, Registry};
@@ -72,6 +73,24 @@ fn declared(registry: &mut Registry, federation: &str, plan: &Plan) {
         for federate in &plan.federates {
             let labels = [federation, federate.name.as_str()];
             registry.set_duration(STP_OFFSET, &labels, federate.stp_offset_ns);
+        }
+        required(registry, federation, plan);
+    }
+}
+
+/// The offsets that the declared bounds ask for, given the senders' offsets.
+fn required(registry: &mut Registry, federation: &str, plan: &Plan) {
+    let federates = plan.federates.iter();
+    let offsets: Vec<_> = federates.map(|it| Some(it.stp_offset_ns)).collect();
+    let links: Vec<_> = plan.connections.iter().filter_map(Link::of).collect();
+    // Without a solution, nothing that is asked for would be enough.
+    let Ok(solution) = stp::solve(&links, &offsets) else {
+        return;
+    };
+    for (federate, offset) in plan.federates.iter().zip(&solution.federates) {
+        if let Some(required) = offset.required_ns {
+            let labels = [federation, federate.name.as_str()];
+            registry.set_duration(STP_OFFSET_REQUIRED, &labels, required);
         }
     }
 }

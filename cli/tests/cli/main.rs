@@ -9,3 +9,4 @@
 mod environment;
 mod golden;
 mod life;
+mod metrics;

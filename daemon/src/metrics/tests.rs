@@ -2,7 +2,9 @@ use std::collections::BTreeMap;
 use std::path::PathBuf;
 
 use ictus_coord::measure::{Downstream, Measures, Own, Upstream};
-use ictus_coord::plan::{ClockPlan, Coordination, FederatePlan, Plan};
+use ictus_coord::plan::{
+    Bounds, ClockPlan, ConnectionPlan, Coordination, Endpoint, FederatePlan, Plan,
+};
 use ictus_coord::report::{ClockSource, ClockStatus, FederateMeasures, FederationMeasures};
 use ictus_metrics::catalogue::ALL;
 use ictus_metrics::{Kind, Page};
@@ -22,7 +24,8 @@ fn measured() -> FederateMeasures {
     measures.sent(2, 16);
     measures.launch_lag(2, span);
     measures.grant_wait(span);
-    measures.deadline_missed(span);
+    let lateness = measures.own().grant_wait.clone();
+    measures.executed(10, 11, &lateness);
     let upstream: BTreeMap<String, Upstream> = measures
         .upstreams()
         .map(|(_, it)| ("a".to_owned(), it.clone()))
@@ -49,8 +52,6 @@ fn measured() -> FederateMeasures {
         behind: true,
         own: Own {
             tags_completed: 9,
-            reactions: 10,
-            watchdogs_fired: 11,
             fell_behind: 12,
             tag_lag,
             ..measures.own().clone()
@@ -70,6 +71,15 @@ fn snapshot(federation: &str) -> Snapshot {
         state: state.to_owned(),
         exit,
         ..MemberView::default()
+    };
+    let declared = |(name, stp_offset_ns): (&str, i64)| FederatePlan {
+        name: name.to_owned(),
+        stp_offset_ns,
+        ..FederatePlan::default()
+    };
+    let end = |federate| Endpoint {
+        federate,
+        ..Endpoint::default()
     };
     Snapshot {
         view: FederationView {
@@ -99,10 +109,17 @@ fn snapshot(federation: &str) -> Snapshot {
                 max_error_ns: Some(250_000),
                 ..ClockPlan::default()
             },
-            federates: vec![FederatePlan {
-                name: "b".to_owned(),
-                stp_offset_ns: 6_400_000,
-                ..FederatePlan::default()
+            federates: [("a", 0), ("b", 6_400_000)].map(declared).to_vec(),
+            connections: vec![ConnectionPlan {
+                from: end(0),
+                to: end(1),
+                after_ns: Some(1_000_000),
+                bounds: Some(Bounds {
+                    launch_lag_ns: 2_000_000,
+                    latency_ns: 5_000_000,
+                    clock_error_ns: 1_000_000,
+                }),
+                ..ConnectionPlan::default()
             }],
             ..Plan::default()
         }),
@@ -128,6 +145,7 @@ fn every_metric_of_the_catalogue_is_served_and_right() {
         ("ictus_clock_synchronized", 1.0),
         ("ictus_clock_steps_total", 8.0),
         ("ictus_stp_offset_seconds", 0.0064),
+        ("ictus_stp_offset_required_seconds", 0.007),
         ("ictus_stp_violations_total", 1.0),
         ("ictus_stp_violation_lateness_seconds_sum", 0.003),
         ("ictus_stp_slack_seconds_count", 1.0),

@@ -187,20 +187,15 @@ impl Measures {
         self.own.tags_completed += 1;
     }
 
-    /// `count` more reactions ran.
-    pub const fn reactions(&mut self, count: u64) {
-        self.own.reactions = self.own.reactions.saturating_add(count);
-    }
-
-    /// A deadline was missed by `late`.
-    pub fn deadline_missed(&mut self, late: Duration) {
-        self.own.deadline_misses += 1;
-        self.own.deadline_lateness.record(late);
-    }
-
-    /// A watchdog fired.
-    pub const fn watchdog_fired(&mut self) {
-        self.own.watchdogs_fired += 1;
+    /// What was executed so far: reactions, watchdogs' handlers, and by how much deadlines were missed. The executor counts these
+    /// itself and hands in the sums.
+    pub fn executed(&mut self, reactions: u64, watchdogs_fired: u64, deadline_lateness: &Histogram) {
+        self.own.reactions = reactions;
+        self.own.watchdogs_fired = watchdogs_fired;
+        if self.own.deadline_misses != deadline_lateness.count() {
+            self.own.deadline_misses = deadline_lateness.count();
+            self.own.deadline_lateness = deadline_lateness.clone();
+        }
     }
 }
 

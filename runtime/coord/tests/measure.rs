@@ -281,10 +281,11 @@ fn apply(measures: &mut Measures, act: &Act) {
             };
             measures.tag_begun(PhysicalTime::from_nanos(nanos), tag);
             measures.grant_wait(span(nanos));
-            measures.deadline_missed(span(nanos));
             measures.tag_completed();
-            measures.reactions(2);
-            measures.watchdog_fired();
+            let mut lateness = measures.own().deadline_lateness.clone();
+            lateness.record(span(nanos));
+            let own = measures.own();
+            measures.executed(own.reactions + 2, own.watchdogs_fired + 1, &lateness);
         }
     }
 }

@@ -10,6 +10,7 @@ use crate::parameters::ParameterError;
 use crate::scope::{DeclaredPort, Elaboration, WiringError};
 use crate::slot::Epoch;
 use ictus_coord::plan::{ConnectionPlan, Endpoint, FederatePlan, Plan};
+use ictus_coord::measure::Histogram;
 use ictus_core::{Delay, Duration, PortId, PortKind, Program, ProgramError, ReactorId, Tag};
 use std::any::Any;
 use std::collections::BTreeSet;
@@ -438,6 +439,7 @@ impl<'a> Assembler<'a> {
             outside: self.outside,
             observer: None,
             counters: Counters::default(),
+            lateness: Histogram::default(),
             fault: None,
         };
         Ok(Assembly {

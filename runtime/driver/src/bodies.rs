@@ -10,6 +10,7 @@ use crate::outside::{Outside, OutsideEvent};
 use crate::scope::{BodyEntry, Case};
 use crate::slot::Epoch;
 use crate::watchdog::{Fired, Watchdogs};
+use ictus_coord::measure::Histogram;
 use ictus_coord::{FederateExecutor, PayloadError};
 use ictus_core::{
     ActionId, Duration, Effects, Executor, InputId, NodeId, NodeKind, OutputId, PhysicalTime,
@@ -39,6 +40,8 @@ pub struct Bodies {
     pub(crate) outside: Arc<Outside>,
     pub(crate) observer: Option<Observer>,
     pub(crate) counters: Counters,
+    /// By how much deadlines were missed.
+    pub(crate) lateness: Histogram,
     pub(crate) fault: Option<Fault>,
 }
 
@@ -100,6 +103,12 @@ impl Bodies {
     #[must_use]
     pub const fn outside(&self) -> &Arc<Outside> {
         &self.outside
+    }
+
+    /// By how much deadlines were missed so far.
+    #[must_use]
+    pub const fn deadline_lateness(&self) -> &Histogram {
+        &self.lateness
     }
 
     /// Moves the queued physical events to `events`, in the order of their arrival.
@@ -191,14 +200,19 @@ impl Bodies {
         if self.fault.is_some() {
             return;
         }
-        let entry = &mut self.bodies[node.index()];
-        let late = match entry.handlers.deadline {
+        let deadline = self.bodies[node.index()].handlers.deadline;
+        let late = deadline.and_then(|deadline| {
+            let late = self.ctx.lag().saturating_add(-deadline);
             // As in LF, a deadline of zero is always missed.
-            Some(deadline) => deadline == Duration::ZERO || self.ctx.lag() > deadline,
-            None => false,
+            (deadline == Duration::ZERO || late > Duration::ZERO).then_some(late)
+        });
+        let case = if let Some(late) = late {
+            self.counters.deadlines_missed += 1;
+            self.lateness.record(late);
+            Case::Deadline
+        } else {
+            Case::Body
         };
-        self.counters.deadlines_missed += u64::from(late);
-        let case = if late { Case::Deadline } else { Case::Body };
         self.react_as(node, case, effects);
     }
 

@@ -605,8 +605,10 @@ impl Runner<'_> {
             received: counters.received,
             deadlines_missed: bodies.deadlines_missed,
         });
-        self.status
-            .say_measures(self.name, self.federate.measures());
+        let measures = self.federate.measures_mut();
+        let lateness = self.bodies.deadline_lateness();
+        measures.executed(bodies.reactions, bodies.watchdogs_fired, lateness);
+        self.status.say_measures(self.name, measures);
     }
 
     /// After the last tag: the last bytes, the trace's end, the last status line, the exit code.

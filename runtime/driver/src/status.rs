@@ -1,7 +1,7 @@
 //! Status lines for whoever started this process (`--status-fd`).
 
 use ictus_coord::measure::Measures;
-use ictus_coord::report::{self, ClockStatus, FederateStatus};
+use ictus_coord::report::{self, FederateStatus};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::fs::OFlags;
 use std::collections::VecDeque;
@@ -86,14 +86,6 @@ impl Status {
         for line in report::lines(federate, measures) {
             self.offer(line);
         }
-    }
-
-    /// Says how well the federate knows physical time, if there is room.
-    pub(crate) fn say_clock(&mut self, federate: &str, clock: &ClockStatus) {
-        self.say(&FederateStatus::Clock {
-            federate: federate.to_owned(),
-            clock: clock.clone(),
-        });
     }
 
     /// Whether somebody listens and reads.

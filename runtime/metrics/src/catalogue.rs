@@ -160,6 +160,14 @@ pub const STP_OFFSET: Metric = Metric {
     labels: &["federation", "federate"],
     help: "The STP offset of the plan, declared or solved.",
 };
+/// The STP offset that the declared bounds require, given the senders' offsets.
+pub const STP_OFFSET_REQUIRED: Metric = Metric {
+    name: "ictus_stp_offset_required_seconds",
+    kind: Kind::Gauge,
+    unit: Unit::Seconds,
+    labels: &["federation", "federate"],
+    help: "The STP offset that the declared bounds require, given the senders' offsets.",
+};
 /// Deadlines missed.
 pub const DEADLINE_MISSES: Metric = Metric {
     name: "ictus_deadline_misses_total",
@@ -330,7 +338,7 @@ pub const DAEMON_BUILD_INFO: Metric = Metric {
 };
 
 /// All of them.
-pub const ALL: [Metric; 32] = [
+pub const ALL: [Metric; 33] = [
     CLOCK_OFFSET,
     CLOCK_ERROR_BOUND,
     CLOCK_ERROR_LIMIT,
@@ -342,6 +350,7 @@ pub const ALL: [Metric; 32] = [
     STP_VIOLATION_LATENESS,
     STP_SLACK,
     STP_OFFSET,
+    STP_OFFSET_REQUIRED,
     DEADLINE_MISSES,
     DEADLINE_LATENESS,
     WATCHDOGS_FIRED,
