@@ -158,7 +158,9 @@ impl Host {
             let (Ok(measures), Ok(view)) = (self.measures(&name).await, self.view(&name)) else {
                 continue;
             };
-            let plan = self.handle(&name).map(|handle| handle.request.plan);
+            let request = self.handle(&name).map(|handle| handle.request);
+            let request = request.or_else(|| self.directory(&name).read_request().ok());
+            let plan = request.map(|request| request.plan);
             snapshots.push(Snapshot {
                 view,
                 measures,

@@ -9,8 +9,8 @@ use ictus_metrics::catalogue::{
     CLOCK_STEPS, CLOCK_SYNCHRONIZED, DAEMON_BUILD_INFO, DEADLINE_LATENESS, DEADLINE_MISSES,
     FALLING_BEHIND, FEDERATE_EXITS, FEDERATE_RESTARTS, FEDERATE_STATE, FEDERATE_UP, FELL_BEHIND,
     GRANT_WAIT, LAUNCH_LAG, MESSAGE_BYTES, MESSAGE_LATENCY, MESSAGES_RECEIVED, MESSAGES_SENT,
-    REACTIONS_EXECUTED, RTI_FEDERATES, RTI_UP, STP_OFFSET, STP_OFFSET_REQUIRED, STP_SLACK, STP_VIOLATION_LATENESS,
-    STP_VIOLATIONS, TAG_LAG, TAGS_COMPLETED, WATCHDOGS_FIRED,
+    REACTIONS_EXECUTED, RTI_FEDERATES, RTI_UP, STP_OFFSET, STP_OFFSET_REQUIRED, STP_SLACK,
+    STP_VIOLATION_LATENESS, STP_VIOLATIONS, TAG_LAG, TAGS_COMPLETED, WATCHDOGS_FIRED,
 };
 use ictus_metrics::{Metric, Registry};
 
@@ -21,7 +21,7 @@ use crate::api::{FederateMeasures, FederationMeasures, FederationView, MemberVie
 pub(crate) struct Snapshot {
     pub(crate) view: FederationView,
     pub(crate) measures: FederationMeasures,
-    /// What it runs; absent when it has ended.
+    /// What it runs, or ran; absent when that cannot be read.
     pub(crate) plan: Option<Plan>,
 }
 

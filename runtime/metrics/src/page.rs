@@ -17,10 +17,13 @@ pub struct Sample {
     /// The name, with `_bucket`, `_sum` or `_count` for a histogram.
     pub name: String,
     /// The labels in the page's order.
-    pub labels: Vec<(String, String)>,
+    pub labels: Labels,
     /// The value.
     pub value: f64,
 }
+
+/// Names and values of labels.
+type Labels = Vec<(String, String)>;
 
 /// Where and why a page is wrong.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -46,8 +49,8 @@ struct Reader {
     family: Option<Metric>,
     helped: Option<Metric>,
     seen: BTreeSet<&'static str>,
-    series: BTreeSet<(String, Vec<(String, String)>)>,
-    histograms: BTreeMap<(&'static str, Vec<(String, String)>), Parts>,
+    series: BTreeSet<(String, Labels)>,
+    histograms: BTreeMap<(&'static str, Labels), Parts>,
 }
 
 /// What was read of one histogram.
