@@ -54,6 +54,7 @@ pub(crate) enum Output {
 enum Command {
     Init(commands::init::Init),
     Check(commands::check::Check),
+    Plan(commands::plan::PlanCommand),
     Up(commands::up::Up),
     Ps(commands::ps::Ps),
     Logs(commands::logs::Logs),
@@ -131,6 +132,7 @@ fn run(cli: Cli) -> ExitCode {
     let result = match cli.command {
         Command::Init(it) => it.run(&mut ui),
         Command::Check(it) => it.run(&mut ui),
+        Command::Plan(it) => it.run(&mut ui),
         Command::Up(it) => it.run(&mut ui),
         Command::Ps(it) => it.run(&mut ui),
         Command::Logs(it) => it.run(&mut ui),

@@ -9,6 +9,7 @@ pub(crate) mod explain;
 pub(crate) mod init;
 pub(crate) mod logs;
 pub(crate) mod metrics;
+pub(crate) mod plan;
 pub(crate) mod ps;
 pub(crate) mod schema;
 pub(crate) mod stop;

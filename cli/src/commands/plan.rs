@@ -1,0 +1,135 @@
+//! `ictus plan`: what runs, how it is connected, and how long each federate waits and why.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use clap::Args;
+use ictus_coord::plan::{ClockSync, ConnectionPlan, Coordination, Endpoint, FederatePlan, Plan};
+use ictus_deploy::{Checked, Offsets};
+use serde::Serialize;
+
+use crate::args::ManifestArgs;
+use crate::error::CliError;
+use crate::session::checked;
+use crate::ui::{Table, Ui, nanoseconds};
+
+/// Show what a manifest runs: federates, connections, and every federate's STP offset with its terms
+#[derive(Debug, Args)]
+pub(crate) struct PlanCommand {
+    #[command(flatten)]
+    manifest: ManifestArgs,
+    /// Run nothing the manifest names; widths, serializers and types are then not known
+    #[arg(long)]
+    no_build: bool,
+}
+
+/// The answer for programs.
+#[derive(Debug, Serialize)]
+struct Answer<'a> {
+    plan: &'a Plan,
+    /// Also under centralized coordination, where they play no part, as far as the bounds suffice.
+    offsets: Option<&'a Offsets>,
+    /// What each federate executes; empty when nothing was built.
+    executables: BTreeMap<&'a str, &'a Path>,
+}
+
+impl PlanCommand {
+    pub(crate) fn run(&self, ui: &mut Ui) -> Result<(), CliError> {
+        let checked = checked(ui, &self.manifest, !self.no_build)?;
+        let runs = checked.federates.iter();
+        let answer = Answer {
+            plan: &checked.plan,
+            offsets: checked.offsets.as_ref(),
+            executables: runs
+                .map(|run| (run.name.as_str(), run.executable.as_path()))
+                .collect(),
+        };
+        ui.result(&answer, || text(&checked))
+    }
+}
+
+fn text(checked: &Checked) -> String {
+    let plan = &checked.plan;
+    let mut text = vec![head(plan), String::new(), federates(plan)];
+    if !plan.connections.is_empty() {
+        text.extend([String::new(), connections(plan)]);
+    }
+    text.push(String::new());
+    text.push(match (plan.coordination, &checked.offsets) {
+        (Coordination::Centralized, _) => {
+            "offsets play no part under centralized coordination: the RTI grants tags".to_owned()
+        }
+        (Coordination::Decentralized, Some(offsets)) => offsets.to_string(),
+        (Coordination::Decentralized, None) => "no offsets".to_owned(),
+    });
+    text.join("\n")
+}
+
+/// What holds for all.
+fn head(plan: &Plan) -> String {
+    let coordination = match plan.coordination {
+        Coordination::Centralized => "centralized",
+        Coordination::Decentralized => "decentralized",
+    };
+    let clocks = match plan.clock.sync {
+        ClockSync::Off => "clocks as they are",
+        ClockSync::Init => "clocks compared at the start",
+        ClockSync::On => "clocks synchronized",
+        ClockSync::External => "clocks of the hosts' own service",
+    };
+    let mut all = vec![coordination.to_owned(), clocks.to_owned()];
+    all.extend(plan.timeout_ns.map(|ns| format!("{} long", nanoseconds(ns))));
+    let words = [
+        (plan.fast, "fast"),
+        (plan.keepalive, "keepalive"),
+        (plan.authentication, "authenticated"),
+    ];
+    let words = words.iter().filter(|(given, _)| *given);
+    all.extend(words.map(|(_, word)| (*word).to_owned()));
+    format!("{}: {}", plan.federation, all.join(", "))
+}
+
+fn federates(plan: &Plan) -> String {
+    let mut table = Table::new(&["FEDERATE", "PROGRAM", "CLASS"]);
+    for FederatePlan {
+        name,
+        program,
+        class,
+        ..
+    } in &plan.federates
+    {
+        let cell = |cell: &Option<String>| cell.clone().unwrap_or_else(|| "foreign".to_owned());
+        table.row([name.clone(), cell(program), cell(class)]);
+    }
+    table.text()
+}
+
+fn connections(plan: &Plan) -> String {
+    let mut table = Table::new(&["CONNECTION", "AFTER", "SERIALIZER"]);
+    for wire in &plan.connections {
+        let after = match wire.after_ns {
+            None => "-".to_owned(),
+            Some(0) => "1 microstep".to_owned(),
+            Some(ns) => nanoseconds(ns),
+        };
+        table.row([connection(plan, wire), after, wire.serializer.clone()]);
+    }
+    table.text()
+}
+
+/// `radar.object -> planner.object`; `~>` for a physical connection, a channel where there are several.
+pub(crate) fn connection(plan: &Plan, wire: &ConnectionPlan) -> String {
+    let name = |end: &Endpoint| {
+        let federate = plan.federates.get(usize::from(end.federate));
+        let federate = federate.map_or("?", |federate| federate.name.as_str());
+        let all = plan.connections.iter();
+        let mut ends = all.flat_map(|wire| [&wire.from, &wire.to]);
+        let same = |one: &Endpoint| (one.federate, &one.port) == (end.federate, &end.port);
+        match ends.any(|one| same(one) && one.channel > 0) {
+            true => format!("{federate}.{}[{}]", end.port, end.channel),
+            false => format!("{federate}.{}", end.port),
+        }
+    };
+    let arrow = if wire.physical { "~>" } else { "->" };
+    format!("{} {arrow} {}", name(&wire.from), name(&wire.to))
+}
