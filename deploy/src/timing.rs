@@ -1,5 +1,6 @@
 //! What the timing files of a run say: order of reactions, order of pairs, end-to-end latency.
 
+mod bounds;
 mod report;
 
 use std::collections::{BTreeMap, BTreeSet};
@@ -9,6 +10,10 @@ use std::path::{Path, PathBuf};
 use ictus_coord::plan::Plan;
 use serde::{Deserialize, Serialize};
 
+pub use self::bounds::{
+    BoundsReport, BoundsRow, FederateBounds, LinkSuggestion, Measure, Spread, Suggestion,
+    bounds_report, suggest,
+};
 pub use self::report::{
     ChainReport, ChainRun, OrderReport, OrderRun, PairReport, PairsReport, Summary, TimingReport,
 };

@@ -78,7 +78,10 @@ fn head(plan: &Plan) -> String {
         ClockSync::External => "clocks of the hosts' own service",
     };
     let mut all = vec![coordination.to_owned(), clocks.to_owned()];
-    all.extend(plan.timeout_ns.map(|ns| format!("{} long", nanoseconds(ns))));
+    all.extend(
+        plan.timeout_ns
+            .map(|ns| format!("{} long", nanoseconds(ns))),
+    );
     let words = [
         (plan.fast, "fast"),
         (plan.keepalive, "keepalive"),
