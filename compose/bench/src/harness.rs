@@ -150,7 +150,8 @@ impl Bench {
         })
     }
 
-    fn federate(&self, plan: &Path) -> Command {
+    /// A program of a plan, to be told which federate it is.
+    pub(crate) fn federate(&self, plan: &Path) -> Command {
         let mut command = Command::new(&self.program);
         command
             .arg("--plan")
@@ -162,7 +163,7 @@ impl Bench {
 }
 
 /// Reads a federate's results to the end.
-fn finish(mut child: Child) -> io::Result<Vec<Value>> {
+pub(crate) fn finish(mut child: Child) -> io::Result<Vec<Value>> {
     let mut text = String::new();
     if let Some(mut stdout) = child.stdout.take() {
         stdout.read_to_string(&mut text)?;
@@ -196,6 +197,19 @@ impl Rti {
     ///
     /// When it cannot be started or does not listen.
     pub(crate) fn start(ictus: &Path, federates: usize) -> io::Result<Self> {
+        Self::start_with(ictus, federates, &[])
+    }
+
+    /// As [`Rti::start`], with more arguments.
+    ///
+    /// # Errors
+    ///
+    /// As [`Rti::start`].
+    pub(crate) fn start_with(
+        ictus: &Path,
+        federates: usize,
+        arguments: &[&str],
+    ) -> io::Result<Self> {
         let mut child = Command::new(ictus)
             .args([
                 "rti",
@@ -207,6 +221,7 @@ impl Rti {
                 "0",
             ])
             .args(["--status-fd", "1"])
+            .args(arguments)
             .stdin(Stdio::null())
             .stdout(Stdio::piped())
             .stderr(Stdio::piped())

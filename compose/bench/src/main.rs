@@ -3,6 +3,7 @@
 //! `ictus bench` builds and runs this. Called with `--plan` it is an ordinary federate program.
 
 mod classes;
+mod clock;
 mod floor;
 mod harness;
 mod rti;
@@ -26,7 +27,12 @@ fn main() -> ExitCode {
             Class::of::<Pong>(),
             Class::of::<Fan>(),
             Class::of::<FanSink>(),
+            Class::of::<clock::Watcher>(),
         ]);
+    }
+    let mut args = std::env::args().skip(1).peekable();
+    if args.next_if(|arg| arg == "clock").is_some() {
+        return clock::main(args);
     }
     table::main()
 }

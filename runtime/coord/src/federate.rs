@@ -172,6 +172,9 @@ pub enum Outcome {
     /// Tag arithmetic left its range.
     #[error("a tag overflowed at {0}")]
     Overflow(Tag),
+    /// The driver found the clock too uncertain to start.
+    #[error("the clock is not good enough: {0}")]
+    Clock(String),
     /// The program itself failed; see the driver's fault.
     #[error("the program failed")]
     Fault,

@@ -25,6 +25,8 @@ pub mod exit {
     pub const NOT_JOINED: u8 = 12;
     /// Stopped the federation after as many STP violations as the plan allows.
     pub const STP_VIOLATIONS: u8 = 14;
+    /// The clock's error bound was greater than the plan allows.
+    pub const CLOCK: u8 = 13;
     /// Wrong command line.
     pub const USAGE: u8 = 64;
 }

@@ -8,6 +8,7 @@ use crate::assembly::{Assembly, words};
 use crate::bodies::Bodies;
 use crate::class::Class;
 use crate::clock::{Clock, SystemClock};
+use crate::clock_sync::{ClockRefusal, ClockSync};
 use crate::observe::Observation;
 use crate::outside::OutsideEvent;
 use crate::peers::Peers;
@@ -15,6 +16,7 @@ use crate::status::Status;
 use crate::transport::{self, Awaited, Connection, Signals, Waker};
 use ictus_coord::FederateExecutor as _;
 use ictus_coord::auth::Nonce;
+use ictus_coord::clock::Interval;
 use ictus_coord::federate::{Federate, FederateConfig, FederateEvent, LinkConfig, Outcome, Poll};
 use ictus_coord::measure::LagNews;
 use ictus_coord::plan::Plan;
@@ -197,7 +199,8 @@ struct Job<'a> {
 }
 
 fn run_one(job: &Job<'_>, ids: &[u16], rti: Option<SocketAddr>) -> Result<u8, RunError> {
-    let clock = Arc::new(SystemClock::new());
+    let clock = Arc::new(clock_of(job.plan, ids, rti));
+    let sync = keep_clock(job.plan, ids, rti, &clock)?;
     let mut assembly = Assembly::new(job.plan, ids, job.classes, clock.clone())?;
     let observation = Observation {
         trace: job.args.trace.clone(),
@@ -223,6 +226,7 @@ fn run_one(job: &Job<'_>, ids: &[u16], rti: Option<SocketAddr>) -> Result<u8, Ru
                 .clone()
                 .unwrap_or_else(default_federation);
             link.authentication = job.plan.authentication.then(nonce).transpose()?;
+            link.clock_port = sync.udp_port();
             Federate::federated(program, config, link)
         }
         (Some(_) | None, _) => Federate::alone(program, config),
@@ -238,6 +242,7 @@ fn run_one(job: &Job<'_>, ids: &[u16], rti: Option<SocketAddr>) -> Result<u8, Ru
         name: job.name,
         plan: job.plan,
         clock,
+        sync,
         federate,
         bodies: assembly.bodies,
         status: Status::new(job.args.status_fd).map_err(RunError::Status)?,
@@ -249,6 +254,45 @@ fn run_one(job: &Job<'_>, ids: &[u16], rti: Option<SocketAddr>) -> Result<u8, Ru
     };
     transport::precise_waits();
     runner.run()
+}
+
+/// The clock that one federate's plan asks for; several in one process have one host's.
+fn clock_of(plan: &Plan, ids: &[u16], rti: Option<SocketAddr>) -> SystemClock {
+    match (rti, ids) {
+        (Some(_), [id]) => SystemClock::of_plan(&plan.clock, &plan.federates[usize::from(*id)]),
+        (Some(_) | None, _) => SystemClock::new(),
+    }
+}
+
+fn keep_clock(
+    plan: &Plan,
+    ids: &[u16],
+    rti: Option<SocketAddr>,
+    clock: &Arc<SystemClock>,
+) -> Result<ClockSync, RunError> {
+    let id = ids.first().copied().unwrap_or_default();
+    let clock = Arc::clone(clock);
+    let mut sync =
+        ClockSync::start(&plan.clock, id, clock, rti, plan.extensions).map_err(RunError::Io)?;
+    let compared = matches!(
+        plan.clock.sync,
+        ictus_coord::plan::ClockSync::Init | ictus_coord::plan::ClockSync::On
+    );
+    if rti.is_some() && !compared {
+        check_clock(&mut sync, &plan.federates[usize::from(id)].name)?;
+    }
+    Ok(sync)
+}
+
+/// Refuses a clock that is not good enough, or only says so, as the plan wants it.
+fn check_clock(sync: &mut ClockSync, name: &str) -> Result<(), ClockRefusal> {
+    match sync.check() {
+        Err(refusal) if !sync.refuses() => {
+            drop(writeln!(io::stderr(), "ictus: federate {name}: {refusal}"));
+            Ok(())
+        }
+        result => result,
+    }
 }
 
 /// LF's default on both sides.
@@ -291,6 +335,7 @@ struct Runner<'a> {
     name: &'a str,
     plan: &'a Plan,
     clock: Arc<SystemClock>,
+    sync: ClockSync,
     federate: Federate,
     bodies: Bodies,
     status: Status,
@@ -397,6 +442,9 @@ impl Runner<'_> {
             && !connection.closed()
         {
             drained = connection.read();
+            // Clocks are compared by when a message was there, not by when it was looked for.
+            let joining = self.start == Tag::NEVER;
+            let now = if joining { self.clock.now() } else { now };
             let used = self
                 .federate
                 .receive(now, connection.bytes(), &mut self.bodies);
@@ -481,9 +529,6 @@ impl Runner<'_> {
     #[cold]
     fn fire_watchdogs(&mut self, now: PhysicalTime) {
         let fired = self.bodies.fire_watchdogs(now);
-        for _ in 0..fired.count {
-            self.federate.measures_mut().watchdog_fired();
-        }
         if fired.stop {
             self.federate.request_stop(now);
         }
@@ -522,10 +567,7 @@ impl Runner<'_> {
             let federate = self.name.to_owned();
             match event {
                 FederateEvent::Joined => self.status.say(&FederateStatus::Joined { federate }),
-                FederateEvent::ClockOffset(interval) => {
-                    let offset = interval.middle(self.clock.now());
-                    self.clock.correct(offset);
-                }
+                FederateEvent::ClockOffset(interval) => self.begin_clock(interval),
                 FederateEvent::Started(start) => {
                     self.start = start;
                     self.bodies.start(start);
@@ -575,6 +617,18 @@ impl Runner<'_> {
         }
     }
 
+    /// The exchanges while joining are done: the clock is corrected, and may be refused.
+    fn begin_clock(&mut self, interval: Interval) {
+        // What was noted by the clock as it was says nothing now.
+        (self.written_at, self.reported_at) = (PhysicalTime::NEVER, PhysicalTime::NEVER);
+        if let Err(error) = self.sync.begin(interval) {
+            self.federate.refuse_clock(error.to_string());
+        }
+        if let Err(refusal) = check_clock(&mut self.sync, self.name) {
+            self.federate.refuse_clock(refusal.to_string());
+        }
+    }
+
     fn elapsed_ns(&self, tag: Tag) -> i64 {
         tag.time.since(self.start.time).as_nanos()
     }
@@ -609,6 +663,23 @@ impl Runner<'_> {
         let lateness = self.bodies.deadline_lateness();
         measures.executed(bodies.reactions, bodies.watchdogs_fired, lateness);
         self.status.say_measures(self.name, measures);
+        self.report_clock();
+    }
+
+    fn report_clock(&mut self) {
+        let federate = self.name.to_owned();
+        if let Some(by) = self.sync.take_step() {
+            let by_ns = by.as_nanos();
+            drop(writeln!(
+                io::stderr(),
+                "ictus: federate {federate}: a clock was stepped by {by}"
+            ));
+            self.status
+                .say(&FederateStatus::ClockStep { federate, by_ns });
+        }
+        let federate = self.name.to_owned();
+        let clock = self.sync.status();
+        self.status.say(&FederateStatus::Clock { federate, clock });
     }
 
     /// After the last tag: the last bytes, the trace's end, the last status line, the exit code.
@@ -709,6 +780,7 @@ impl Runner<'_> {
             Some(outcome @ Outcome::TooManyViolations(_)) => {
                 (exit::STP_VIOLATIONS, outcome.to_string())
             }
+            Some(outcome @ Outcome::Clock(_)) => (exit::CLOCK, outcome.to_string()),
             Some(outcome) => (exit::FAILED, outcome.to_string()),
         }
     }

@@ -11,6 +11,7 @@ use ictus_coord::report::exit;
 
 pub mod options;
 mod outlet;
+mod probing;
 mod server;
 mod socket;
 pub mod status;

@@ -3,6 +3,7 @@
 use std::ffi::OsString;
 use std::net::{IpAddr, Ipv4Addr};
 
+use ictus_clock::Stamps;
 use ictus_coord::plan::Wire;
 use ictus_coord::rti::RtiConfig;
 use ictus_core::Duration;
@@ -13,6 +14,8 @@ pub const DEFAULT_PORT: u16 = 15045;
 pub const DEFAULT_FEDERATION: &str = "Unidentified Federation";
 /// LF's default number of clock exchanges; compiled into its federates.
 const DEFAULT_EXCHANGES: u32 = 10;
+/// LF's default time between two exchanges.
+const DEFAULT_PERIOD: Duration = Duration::from_millis(10);
 /// LF's launchers write this where an option is left out; LF's RTI skips it.
 const BLANK: &str = " ";
 /// A payload's length is a signed 32-bit number on the wire.
@@ -32,8 +35,11 @@ Coordinates one federation; takes the options of Lingua Franca's RTI.
                                 0.0.0.0, for all)
   -a, --auth                    only federates join that prove to know the federation's id (HMAC)
   -c, --clock_sync off|init|initial|on [period NS] [exchanges-per-interval K]
-                                compare clocks while federates join (default off; `initial` and `on` are
-                                `init`)
+                                compare clocks while federates join, `on`: and every period from then on
+                                (default off; 10 ms; 10 exchanges)
+      --clock-port PORT         UDP port for that (default 0: any free one; LF's RTI: 15061)
+      --clock-stamps kernel|reader
+                                who says when a datagram came (default kernel)
   -d, --dnet_disabled           send no downstream next event tags
   -m, --start-time-multiple VALUE UNIT
                                 round the start time up to a multiple; units from ns to weeks
@@ -68,6 +74,10 @@ pub struct Options {
     pub bind_is_default: bool,
     /// The TCP port to listen on; 0: the system chooses one.
     pub port: u16,
+    /// The UDP port from which clocks are compared; 0: the system chooses one.
+    pub clock_port: u16,
+    /// Who says when a datagram came.
+    pub stamps: Stamps,
     /// The inherited descriptor for status lines.
     pub status_fd: Option<u32>,
     /// What was asked for and is done differently, for people.
@@ -118,6 +128,8 @@ impl Options {
             bind: IpAddr::V4(Ipv4Addr::LOCALHOST),
             bind_is_default: true,
             port: 0,
+            clock_port: 0,
+            stamps: Stamps::Kernel,
             status_fd: None,
             warnings: Vec::new(),
         }
@@ -186,6 +198,10 @@ impl Parser {
             "-c" | "--clock_sync" => self.clock_sync(option)?,
             "-a" | "--auth" => self.options.config.authentication = true,
             "--continue" => self.continue_without(option)?,
+            "--clock-port" => {
+                self.options.clock_port = self.number(option, "a port (0 to 65535)")?
+            }
+            "--clock-stamps" => self.options.stamps = self.stamps(option)?,
             "-d" | "--dnet_disabled" => self.options.config.dnet = false,
             "-m" | "--start-time-multiple" => {
                 self.options.config.start_multiple = Some(self.multiple(option)?);
@@ -293,25 +309,21 @@ impl Parser {
     fn clock_sync(&mut self, option: &str) -> Result<(), UsageError> {
         let mode = self.value(option)?;
         let mut exchanges = DEFAULT_EXCHANGES;
+        let mut period = DEFAULT_PERIOD;
         while let Some(key) = self
             .arguments
             .next_if(|word| matches!(word.as_str(), "period" | "exchanges-per-interval" | BLANK))
         {
             match key.as_str() {
                 BLANK => {}
-                "period" => drop(self.number::<u64>(&key, "nanoseconds")?),
+                "period" => period = self.period(&key)?,
                 _ => exchanges = self.number(&key, "a number")?,
             }
         }
+        self.options.config.clock_period = (mode == "on").then_some(period);
         self.options.config.clock_exchanges = match mode.as_str() {
             "off" => 0,
-            "init" | "initial" => exchanges,
-            "on" => {
-                let warning =
-                    "clocks are compared while federates join, not later: `-c on` is `-c init`";
-                self.options.warnings.push(warning.to_owned());
-                exchanges
-            }
+            "init" | "initial" | "on" => exchanges,
             _ => return invalid(option, "off, init, initial or on", mode),
         };
         Ok(())
@@ -323,6 +335,23 @@ impl Parser {
             "0.12" => Ok(Wire::V0_12),
             "0.13" => Ok(Wire::V0_13),
             _ => invalid(option, "0.12 or 0.13", value),
+        }
+    }
+
+    fn period(&mut self, option: &str) -> Result<Duration, UsageError> {
+        let expected = "nanoseconds, from 100000 (100 us) to 60000000000 (a minute)";
+        match self.number(option, expected)? {
+            nanos @ 100_000..=60_000_000_000 => Ok(Duration::from_nanos(nanos)),
+            nanos => invalid(option, expected, nanos.to_string()),
+        }
+    }
+
+    fn stamps(&mut self, option: &str) -> Result<Stamps, UsageError> {
+        let value = self.value(option)?;
+        match value.as_str() {
+            "kernel" => Ok(Stamps::Kernel),
+            "reader" => Ok(Stamps::Reader),
+            _ => invalid(option, "kernel or reader", value),
         }
     }
 
@@ -391,7 +420,17 @@ mod tests {
         let options = parse("-n 1 -c on period 5000000 exchanges-per-interval 3 -d").unwrap();
         assert_eq!(options.config.clock_exchanges, 3);
         assert!(!options.config.dnet);
-        assert_eq!(options.warnings.len(), 1);
+        assert_eq!(options.config.clock_period, Some(Duration::from_millis(5)));
+        assert_eq!(options.warnings.len(), 0);
+        let options = parse("-n 1 -c on --clock-port 15061").unwrap();
+        assert_eq!(options.config.clock_period, Some(Duration::from_millis(10)));
+        assert_eq!(
+            (options.clock_port, options.stamps),
+            (15_061, Stamps::Kernel)
+        );
+        let options = parse("-n 1 -c init period 5000000 --clock-stamps reader").unwrap();
+        assert_eq!(options.config.clock_period, None);
+        assert_eq!(options.stamps, Stamps::Reader);
     }
 
     #[test]
@@ -482,6 +521,10 @@ mod tests {
             (
                 "-n 3 --continue 1,",
                 "`--continue` takes ids of federates, below `-n`, with commas between them, not `1,`",
+            ),
+            (
+                "-n 1 -c on period 5",
+                "`period` takes nanoseconds, from 100000 (100 us) to 60000000000 (a minute), not `5`",
             ),
             (
                 "-n 1 -nt 2",

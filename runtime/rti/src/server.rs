@@ -2,8 +2,9 @@
 
 use std::io::{self, Read};
 use std::net::SocketAddr;
-use std::time::{Duration, SystemTime};
+use std::time::Duration;
 
+use ictus_clock::HostClock;
 use ictus_coord::auth::Nonce;
 use ictus_coord::rti::{ConnectionId, Disconnect, Newcomer, Rti, RtiEvent};
 use ictus_core::PhysicalTime;
@@ -14,11 +15,13 @@ use rustix::net::sockopt;
 use signal_hook::consts::{SIGINT, SIGTERM};
 
 use crate::options::Options;
+use crate::probing::Probing;
 use crate::socket::{Flushed, READ, Received, Socket};
 use crate::status::Status;
 
 const LISTENER: Token = Token(usize::MAX);
 const SIGNALS: Token = Token(usize::MAX - 1);
+const PROBES: Token = Token(usize::MAX - 2);
 /// Connections that have not said who they are, beyond those of the federates.
 const STRANGERS: usize = 256;
 /// The most connections accepted in one round: all are read, four times at least, before the oldest must make room.
@@ -40,6 +43,8 @@ pub struct Server {
     sockets: Vec<Option<Socket>>,
     most_sockets: usize,
     rti: Rti,
+    clock: HostClock,
+    probing: Option<Probing>,
     status: Status,
     buffer: Vec<u8>,
     port: u16,
@@ -77,6 +82,14 @@ pub enum BindError {
         /// Why.
         source: io::Error,
     },
+    /// The UDP address for probes cannot be used.
+    #[error("cannot compare clocks at UDP {address}: {source}")]
+    Probes {
+        /// The address.
+        address: SocketAddr,
+        /// Why.
+        source: io::Error,
+    },
     /// The system refuses to wait for sockets or signals.
     #[error("cannot wait for events: {0}")]
     Poll(#[from] io::Error),
@@ -105,6 +118,10 @@ impl Server {
         poll.registry()
             .register(&mut listener, LISTENER, Interest::READABLE)?;
         let port = listener.local_addr()?.port();
+        let probing = match options.config.clock_period {
+            Some(_) => Some(open_probes(&poll, options)?),
+            None => None,
+        };
         for warning in &options.warnings {
             status.say(warning);
         }
@@ -117,6 +134,8 @@ impl Server {
             sockets: Vec::new(),
             most_sockets: usize::from(options.config.federates) + STRANGERS,
             rti: Rti::new(options.config.clone()),
+            clock: reference(options),
+            probing,
             status,
             buffer: vec![0; 2 * READ],
             port,
@@ -163,12 +182,13 @@ impl Server {
                 Err(error) if error.kind() == io::ErrorKind::Interrupted => continue,
                 Err(error) => return Err(error.into()),
             }
-            let now = physical_time();
+            let now = self.clock.now();
             let woken = self.note(&events, now);
             if self.accepting != Accepting::Idle {
                 self.accept(now);
             }
-            self.read_round(now);
+            self.read_round();
+            let now = self.clock.now();
             if self
                 .rti
                 .poll_timeout()
@@ -178,6 +198,7 @@ impl Server {
             }
             self.rti.drain(now);
             self.write_round(&woken);
+            self.probe();
             self.report();
             if let Some(code) = self.rti.finished() {
                 self.status.finish();
@@ -189,7 +210,8 @@ impl Server {
     /// How long nothing needs to be done; `None`: until an event.
     fn patience(&self) -> Option<Duration> {
         let readable = self.sockets.iter().flatten().any(|socket| socket.readable);
-        if readable || self.accepting == Accepting::Ready {
+        let probed = self.probing.as_ref().is_some_and(|p| p.readable);
+        if readable || probed || self.accepting == Accepting::Ready {
             return Some(Duration::ZERO);
         }
         let stuck = self.accepting == Accepting::Stuck;
@@ -197,7 +219,7 @@ impl Server {
         let deadline = self
             .rti
             .poll_timeout()
-            .map(|deadline| deadline.since(physical_time()).to_std() + Duration::from_millis(1));
+            .map(|deadline| deadline.since(self.clock.now()).to_std() + Duration::from_millis(1));
         match (again, deadline) {
             (Some(a), Some(b)) => Some(a.min(b)),
             (a, b) => a.or(b),
@@ -211,6 +233,11 @@ impl Server {
             match event.token() {
                 LISTENER => self.accepting = Accepting::Ready,
                 SIGNALS => self.take_signals(now),
+                PROBES => {
+                    if let Some(probing) = &mut self.probing {
+                        probing.readable = true;
+                    }
+                }
                 Token(index) => {
                     let Some(Some(socket)) = self.sockets.get_mut(index) else {
                         continue;
@@ -317,7 +344,7 @@ impl Server {
     }
 
     /// One read from every socket that may have something.
-    fn read_round(&mut self, now: PhysicalTime) {
+    fn read_round(&mut self) {
         for index in 0..self.sockets.len() {
             let Some(socket) = &mut self.sockets[index] else {
                 continue;
@@ -326,9 +353,12 @@ impl Server {
                 continue;
             }
             let id = ConnectionId::from_index(index);
-            if let Received::Ended(why) = socket.receive(&mut self.rti, now, id, &mut self.buffer) {
+            if let Received::Ended(why) =
+                socket.receive(&mut self.rti, &self.clock, id, &mut self.buffer)
+            {
                 // A refusal may be waiting for a peer that has closed only its own half.
                 socket.flush(self.rti.output(id));
+                let now = self.clock.now();
                 self.remove(id, now, &why);
             }
         }
@@ -348,7 +378,8 @@ impl Server {
             return;
         };
         if socket.flush(self.rti.output(id)) == Flushed::Close {
-            self.remove(id, physical_time(), &Disconnect::Eof);
+            let now = self.clock.now();
+            self.remove(id, now, &Disconnect::Eof);
         }
     }
 
@@ -358,6 +389,18 @@ impl Server {
             let _already = self.poll.registry().deregister(socket.stream_mut());
         }
         self.rti.disconnect(now, id, why);
+    }
+
+    /// A socket that fails takes the comparison of clocks with it, not the federation: bounds grow, and tell.
+    fn probe(&mut self) {
+        let Some(probing) = &mut self.probing else {
+            return;
+        };
+        if let Err(error) = probing.round(&mut self.rti, &self.clock) {
+            let words = format!("clocks are compared no more: {error}");
+            self.status.say(&words);
+            self.probing = None;
+        }
     }
 
     fn report(&mut self) {
@@ -370,6 +413,23 @@ impl Server {
         }
         self.status.flush();
     }
+}
+
+/// The federation's clock: the host's as it is; while others follow it, one that nobody steps.
+fn reference(options: &Options) -> HostClock {
+    if options.config.clock_exchanges == 0 {
+        HostClock::system()
+    } else {
+        HostClock::steady()
+    }
+}
+
+fn open_probes(poll: &Poll, options: &Options) -> Result<Probing, BindError> {
+    let (bind, port) = (options.bind, options.clock_port);
+    Probing::open(poll, PROBES, bind, port, options.stamps).map_err(|source| BindError::Probes {
+        address: SocketAddr::new(bind, port),
+        source,
+    })
 }
 
 /// How long a peer's host may acknowledge nothing, or its program take nothing of what waits for it.
@@ -412,14 +472,6 @@ fn nonce() -> io::Result<Nonce> {
     let mut nonce = Nonce::default();
     getrandom::fill(&mut nonce)?;
     Ok(nonce)
-}
-
-/// The host's clock.
-fn physical_time() -> PhysicalTime {
-    let since_epoch = SystemTime::now()
-        .duration_since(SystemTime::UNIX_EPOCH)
-        .unwrap_or_default();
-    PhysicalTime::from_nanos(i64::try_from(since_epoch.as_nanos()).unwrap_or(i64::MAX))
 }
 
 #[cfg(test)]

@@ -3,8 +3,8 @@
 use std::io::{ErrorKind, Read, Write};
 use std::net::Shutdown;
 
+use ictus_clock::HostClock;
 use ictus_coord::rti::{Closing, ConnectionId, Disconnect, Output, Rti};
-use ictus_core::PhysicalTime;
 use mio::net::TcpStream;
 
 /// The most that is read from one socket before others have their turn (bytes).
@@ -73,12 +73,13 @@ impl Socket {
         &mut self.stream
     }
 
-    /// Reads once, at most [`READ`] bytes, and hands complete messages to the state machine. A peer that goes on sending
+    /// Reads once, at most [`READ`] bytes, and hands complete messages to the state machine with the time after
+    /// that, by which clocks are compared. A peer that goes on sending
     /// after [`FAREWELL`] is read no more; the connection ends as soon as all is written.
     pub(crate) fn receive(
         &mut self,
         rti: &mut Rti,
-        now: PhysicalTime,
+        clock: &HostClock,
         id: ConnectionId,
         buffer: &mut [u8],
     ) -> Received {
@@ -91,7 +92,7 @@ impl Socket {
             };
         }
         if self.leftover.len() > SMALL {
-            return self.receive_behind(rti, now, id);
+            return self.receive_behind(rti, clock, id);
         }
         let kept = self.leftover.len();
         buffer[..kept].copy_from_slice(&self.leftover);
@@ -101,7 +102,7 @@ impl Socket {
             Ok(0) => Received::Open,
             Ok(read) => {
                 let bytes = &buffer[..kept + read];
-                let taken = rti.receive(now, id, bytes);
+                let taken = rti.receive(clock.now(), id, bytes);
                 self.leftover.clear();
                 self.leftover.extend_from_slice(&bytes[taken..]);
                 Received::Open
@@ -111,7 +112,7 @@ impl Socket {
     }
 
     /// As [`Socket::receive`], for a message too long to be moved about.
-    fn receive_behind(&mut self, rti: &mut Rti, now: PhysicalTime, id: ConnectionId) -> Received {
+    fn receive_behind(&mut self, rti: &mut Rti, clock: &HostClock, id: ConnectionId) -> Received {
         let kept = self.leftover.len();
         self.leftover.resize(kept + READ, 0);
         let result = self.stream.read(&mut self.leftover[kept..]);
@@ -121,7 +122,7 @@ impl Socket {
         match judged {
             Ok(0) => Received::Open,
             Ok(_) => {
-                let taken = rti.receive(now, id, &self.leftover);
+                let taken = rti.receive(clock.now(), id, &self.leftover);
                 self.leftover.drain(..taken);
                 if self.leftover.len() <= SMALL {
                     self.leftover.shrink_to(SMALL);

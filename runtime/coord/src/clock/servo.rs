@@ -160,15 +160,29 @@ impl Servo {
     #[must_use]
     pub fn status(&self, base: PhysicalTime) -> ClockStatus {
         ClockStatus {
-            source: ClockSource::Builtin,
-            offset_ns: self.correction.at(base).as_nanos(),
-            drift_ppb: -self.correction.drift_ppb,
             bound_ns: self.bound(base).map(Duration::as_nanos),
-            synchronized: self.is_synchronized(base),
             probes_kept: self.kept,
             probes_dropped: self.dropped,
-            strangers: 0,
             steps: self.steps,
+            ..Self::status_of(base, &self.correction, self.interval.as_ref())
+        }
+    }
+
+    /// What a correction and an interval say of a clock, when its base shows `base`; nothing is counted.
+    #[must_use]
+    pub fn status_of(
+        base: PhysicalTime,
+        correction: &Correction,
+        interval: Option<&Interval>,
+    ) -> ClockStatus {
+        let applied = correction.at(base);
+        ClockStatus {
+            source: ClockSource::Builtin,
+            offset_ns: applied.as_nanos(),
+            drift_ppb: -correction.drift_ppb,
+            bound_ns: interval.map(|interval| interval.bound(base, applied).as_nanos()),
+            synchronized: interval.is_some_and(|interval| interval.contains(base, applied)),
+            ..ClockStatus::default()
         }
     }
 

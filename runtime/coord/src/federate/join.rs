@@ -107,6 +107,11 @@ impl Federate {
         }
     }
 
+    /// Ends before the start, because the clock is too uncertain.
+    pub fn refuse_clock(&mut self, why: String) {
+        self.end_with(Outcome::Clock(why));
+    }
+
     /// Waits for the next step of joining, but not for ever.
     pub(super) fn await_answer(&mut self, now: PhysicalTime) -> Poll {
         let by = *self.answer_by.get_or_insert(now.saturating_add(ANSWER_MAX));

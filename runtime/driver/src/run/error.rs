@@ -1,6 +1,7 @@
 //! Why a program cannot run.
 
 use crate::assembly::AssemblyError;
+use crate::clock_sync::ClockRefusal;
 use ictus_coord::report::exit;
 use std::io;
 use std::net::SocketAddr;
@@ -66,6 +67,9 @@ pub enum RunError {
     /// The system refused to wait or to make a descriptor.
     #[error("system error: {0}")]
     Io(io::Error),
+    /// The clock is too uncertain to start.
+    #[error(transparent)]
+    Clock(#[from] ClockRefusal),
     /// A second signal, or one before the start.
     #[error("interrupted")]
     Interrupted,
@@ -78,6 +82,7 @@ impl RunError {
         match self {
             Self::UnknownFederate { .. } | Self::NeedsRti | Self::BadAddress { .. } => exit::USAGE,
             Self::Connect { .. } => exit::NOT_JOINED,
+            Self::Clock(_) => exit::CLOCK,
             Self::ReadPlan { .. }
             | Self::ParsePlan { .. }
             | Self::Assembly(_)
