@@ -75,10 +75,10 @@ impl HostClock {
         PhysicalTime::from_nanos(reading + self.skew.offset_ns + gained)
     }
 
-    /// How far the system clock is ahead of this one, artificial errors left out.
+    /// How far the system clock is ahead of this one.
     #[must_use]
     pub fn behind_system(&self) -> Duration {
-        let (pair, _) = closest_pair(|| self.unskewed());
+        let (pair, _) = closest_pair(|| self.now().as_nanos());
         Duration::from_nanos(pair)
     }
 

@@ -4,7 +4,7 @@
 //! the two meet in the [`SystemClock`] only, which takes no lock.
 
 use crate::clock::SystemClock;
-use ictus_clock::{ProbeSocket, Stamps, StepWatch};
+use ictus_clock::{ProbeSocket, Sources, Stamps, StepWatch};
 use ictus_coord::clock::{Correction, Follower, Interval, Servo};
 use ictus_coord::plan::{ClockPlan, ClockSync as Mode, OnExceed};
 use ictus_coord::report::ClockStatus;
@@ -15,8 +15,10 @@ use std::net::SocketAddr;
 use std::sync::{Arc, Mutex, PoisonError};
 use thiserror::Error;
 
+mod external;
 mod probed;
 
+use external::External;
 use probed::{Probed, Task};
 
 /// The clock of one federate, and who keeps it. Dropped, it is corrected no more.
@@ -28,6 +30,7 @@ pub(crate) struct ClockSync {
     waiting: Option<(ProbeSocket, Follower)>,
     port: u16,
     probed: Option<Probed>,
+    external: Option<External>,
     /// Exchanges while joining, when there are no others.
     joining: Option<Interval>,
     watch: StepWatch,
@@ -73,10 +76,14 @@ impl ClockSync {
             waiting: None,
             port: NO_CLOCK_SYNC,
             probed: None,
+            external: None,
             joining: None,
             watch: StepWatch::new(),
             steps: 0,
         };
+        if matches!(plan.sync, Mode::External | Mode::On) {
+            sync.external = Some(External::start(Sources::default())?);
+        }
         let Some(rti) = rti else { return Ok(sync) };
         match plan.sync {
             Mode::Off | Mode::External => {}
@@ -115,12 +122,12 @@ impl ClockSync {
         let mut servo = Servo::new(&self.plan);
         servo.begin(base, joining);
         self.clock.step(servo.correction());
-        let clock = Arc::clone(&self.clock);
         self.probed = Some(Probed::start(Task {
             socket,
             follower,
             servo,
-            clock,
+            clock: Arc::clone(&self.clock),
+            external: self.external.as_ref().map(External::shared),
         })?);
         Ok(())
     }
@@ -128,13 +135,14 @@ impl ClockSync {
     /// What is known of the clock now.
     pub(crate) fn status(&mut self) -> ClockStatus {
         let base = self.clock.base();
-        let mut status = match (&self.probed, &self.joining) {
-            (Some(probed), _) => probed.status(base),
-            (None, Some(joining)) => {
+        let mut status = match (&self.probed, &self.joining, &self.external) {
+            (Some(probed), ..) => probed.status(base),
+            (None, Some(joining), _) => {
                 let correction = self.clock.correction();
                 Servo::status_of(base, &correction, Some(joining))
             }
-            (None, None) => ClockStatus::default(),
+            (None, None, Some(external)) => external.status(),
+            (None, None, None) => ClockStatus::default(),
         };
         status.steps += self.steps;
         status

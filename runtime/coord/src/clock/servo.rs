@@ -31,6 +31,7 @@ pub struct Servo {
     window: Window,
     interval: Option<Interval>,
     drift_ppb: Option<f64>,
+    trusted: Option<(Duration, Duration)>,
     correction: Correction,
     kept: u64,
     dropped: u64,
@@ -63,6 +64,7 @@ impl Servo {
             window: Window::default(),
             interval: None,
             drift_ppb: None,
+            trusted: None,
             correction: Correction::NONE,
             kept: 0,
             dropped: 0,
@@ -111,6 +113,24 @@ impl Servo {
         } else {
             Taken::Dropped
         }
+    }
+
+    /// Says what somebody else takes for the offset, and how far that may be off. It is followed while it is surer than what the
+    /// exchanges say, and does not contradict them.
+    pub const fn trust(&mut self, external: Option<(Duration, Duration)>) {
+        self.trusted = external;
+    }
+
+    /// Whether somebody else is followed, when the base clock shows `base`.
+    #[must_use]
+    pub fn is_external(&self, base: PhysicalTime) -> bool {
+        let better = |(offset, bound): (Duration, Duration)| {
+            let middle = |interval: &Interval| interval.bound(base, interval.middle(base));
+            self.interval
+                .as_ref()
+                .is_some_and(|i| i.contains(base, offset) && bound < middle(i))
+        };
+        self.trusted.is_some_and(better)
     }
 
     /// Says that an exchange was begun and not ended.
@@ -243,7 +263,10 @@ impl Servo {
         };
         let applied = self.correction.at(base);
         let drift = self.drift_ppb.unwrap_or(0.0);
-        let fitted = if self.mutants.has(Mutant::ClockUnfiltered) {
+        let external = self.trusted.filter(|_| self.is_external(base));
+        let fitted = if let Some((offset, _)) = external {
+            Some(offset)
+        } else if self.mutants.has(Mutant::ClockUnfiltered) {
             Interval::of(latest).map(|latest| latest.middle(base))
         } else {
             self.drift_ppb

@@ -1,5 +1,6 @@
 //! The thread that answers probes and owns the servo.
 
+use super::external::Shared;
 use super::lock;
 use crate::clock::SystemClock;
 use crate::transport;
@@ -20,6 +21,7 @@ pub(super) struct Task {
     pub(super) follower: Follower,
     pub(super) servo: Servo,
     pub(super) clock: Arc<SystemClock>,
+    pub(super) external: Option<Shared>,
 }
 
 /// A running thread.
@@ -59,6 +61,7 @@ impl Probed {
         let known = lock(&self.known).clone();
         let now = Servo::status_of(base, &known.correction, known.interval.as_ref());
         ClockStatus {
+            source: known.status.source,
             probes_kept: known.status.probes_kept,
             probes_dropped: known.status.probes_dropped,
             strangers: known.status.strangers,
@@ -124,6 +127,7 @@ impl Task {
                 self.follower.answered(t3);
             }
             Heard::Complete(exchange, survived) => {
+                self.servo.trust(self.external_offset());
                 let base = self.clock.base();
                 if let Taken::Step(by) = self.servo.take(base, exchange, survived) {
                     step = Some(by);
@@ -137,8 +141,20 @@ impl Task {
         *known = self.known(step);
     }
 
+    /// What the host's time service says must be added to the base clock, and how far that may be off.
+    fn external_offset(&self) -> Option<(Duration, Duration)> {
+        let found = (*lock(self.external.as_ref()?)).filter(|found| found.synchronized)?;
+        let offset = self.clock.host().behind_system() + found.offset;
+        Some((offset, found.bound))
+    }
+
     fn known(&self, step: Option<Duration>) -> Known {
-        let mut status = self.servo.status(self.clock.base());
+        let base = self.clock.base();
+        let mut status = self.servo.status(base);
+        let external = self.external.as_ref().and_then(|found| *lock(found));
+        if let Some(found) = external.filter(|_| self.servo.is_external(base)) {
+            status.source = found.source;
+        }
         status.strangers = self.follower.strangers();
         Known {
             status,
