@@ -604,7 +604,11 @@ impl Federate {
     /// Notes how long a tag that was asked for waited for nothing but its grant.
     fn note_granted(&mut self, now: PhysicalTime, asked: PhysicalTime, tag: Tag) {
         let due = tag.time.as_physical();
-        let ready = if self.config.fast { asked } else { asked.max(due) };
+        let ready = if self.config.fast {
+            asked
+        } else {
+            asked.max(due)
+        };
         self.measures.grant_wait(now.since(ready));
     }
 

@@ -189,7 +189,12 @@ impl Measures {
 
     /// What was executed so far: reactions, watchdogs' handlers, and by how much deadlines were missed. The executor counts these
     /// itself and hands in the sums.
-    pub fn executed(&mut self, reactions: u64, watchdogs_fired: u64, deadline_lateness: &Histogram) {
+    pub fn executed(
+        &mut self,
+        reactions: u64,
+        watchdogs_fired: u64,
+        deadline_lateness: &Histogram,
+    ) {
         self.own.reactions = reactions;
         self.own.watchdogs_fired = watchdogs_fired;
         if self.own.deadline_misses != deadline_lateness.count() {

@@ -160,16 +160,32 @@ fn strangers_are_refused_with_the_reason_that_lf_gives() {
     let mut world = World::new(&plan("stop-federation", ""));
     let _sender = world.meets(1);
     let cases: [(&[u8], ToPeer<'_>, RejectReason); 4] = [
-        (b"wrong federation", hello(2, b"tess"), RejectReason::FederationId),
-        (b"a longer id", hello(2, b"test2"), RejectReason::FederationId),
-        (b"nobody's sender", hello(9, b"test"), RejectReason::FederateIdOutOfRange),
+        (
+            b"wrong federation",
+            hello(2, b"tess"),
+            RejectReason::FederationId,
+        ),
+        (
+            b"a longer id",
+            hello(2, b"test2"),
+            RejectReason::FederationId,
+        ),
+        (
+            b"nobody's sender",
+            hello(9, b"test"),
+            RejectReason::FederateIdOutOfRange,
+        ),
         (b"twice", hello(1, b"test"), RejectReason::FederateIdInUse),
     ];
     for (name, hello, reason) in cases {
         let stream = world.federate.peer_accepted();
         world.says(stream, &hello);
         let name = String::from_utf8_lossy(name);
-        assert_eq!(world.answer(stream), Some(FromPeer::Reject(reason)), "{name}");
+        assert_eq!(
+            world.answer(stream),
+            Some(FromPeer::Reject(reason)),
+            "{name}"
+        );
         assert!(world.federate.peer_over(stream), "{name}");
     }
     let stream = world.federate.peer_accepted();
@@ -182,14 +198,21 @@ fn strangers_are_refused_with_the_reason_that_lf_gives() {
         said += u32::from(matches!(event, FederateEvent::PeerRefused(_)));
     }
     assert_eq!(said, 5, "each is told once");
-    assert!(world.federate.outcome().is_none(), "and nothing else happens");
+    assert!(
+        world.federate.outcome().is_none(),
+        "and nothing else happens"
+    );
 }
 
 #[test]
 fn messages_wait_until_the_start_tag_is_known() {
     let mut world = World::new(&plan("stop-federation", ""));
     let sender = world.meets(1);
-    assert_eq!(world.says(sender, &message(0, 0, 3)), 0, "offered again later");
+    assert_eq!(
+        world.says(sender, &message(0, 0, 3)),
+        0,
+        "offered again later"
+    );
     world.start();
     assert!(world.says(sender, &message(0, 0, 3)) > 0);
     assert_eq!(world.federate.counters().received, 1);
@@ -268,10 +291,22 @@ fn what_the_plan_does_not_allow_ends_the_federate_and_names_the_sender() {
         payload: &[1],
     });
     let cases = [
-        (message(7, 0, 1), "federate 1 broke the protocol: message for unknown port 7"),
-        (message(0, 2, 1), "federate 1 broke the protocol: message for federate 2"),
-        (message(1, 0, 1), "port 1, which the plan does not let federate 1 write"),
-        (physical, "port 0, which the plan does not let federate 1 write"),
+        (
+            message(7, 0, 1),
+            "federate 1 broke the protocol: message for unknown port 7",
+        ),
+        (
+            message(0, 2, 1),
+            "federate 1 broke the protocol: message for federate 2",
+        ),
+        (
+            message(1, 0, 1),
+            "port 1, which the plan does not let federate 1 write",
+        ),
+        (
+            physical,
+            "port 0, which the plan does not let federate 1 write",
+        ),
         (hello(1, b"test"), "unexpected a second hello"),
     ];
     for (message, words) in cases {

@@ -200,16 +200,20 @@ impl Bodies {
         if self.fault.is_some() {
             return;
         }
-        let deadline = self.bodies[node.index()].handlers.deadline;
-        let late = deadline.and_then(|deadline| {
+        let handlers = self.bodies[node.index()].handlers;
+        let late = handlers.deadline.and_then(|deadline| {
             let late = self.ctx.lag().saturating_add(-deadline);
             // As in LF, a deadline of zero is always missed.
             (deadline == Duration::ZERO || late > Duration::ZERO).then_some(late)
         });
+        // As in LF, a missed deadline comes before tardiness.
         let case = if let Some(late) = late {
             self.counters.deadlines_missed += 1;
             self.lateness.record(late);
             Case::Deadline
+        } else if handlers.stp && self.ctx.intended.is_some() {
+            self.counters.stp_handled += 1;
+            Case::Stp
         } else {
             Case::Body
         };
@@ -323,15 +327,8 @@ impl Executor for Bodies {
 
     #[cold]
     fn run_tardy(&mut self, node: NodeId, tag: Tag, intended: Tag, effects: &mut Effects) {
-        let stp = |entry: &BodyEntry| entry.handlers.stp;
         self.ctx.intended = Some(intended);
-        // Reactions come first among the nodes.
-        if self.bodies.get(node.index()).is_some_and(stp) && self.fault.is_none() {
-            self.counters.stp_handled += 1;
-            self.react_as(node, Case::Stp, effects);
-        } else {
-            self.run(node, tag, effects);
-        }
+        self.run(node, tag, effects);
         self.ctx.intended = None;
     }
 

@@ -445,7 +445,7 @@ pub enum Case {
     Body,
     /// The handler of a missed deadline.
     Deadline,
-    /// The handler of a tardy message; a deadline missed as well does not matter then.
+    /// The handler of a tardy message; a deadline missed as well comes first.
     Stp,
 }
 

@@ -1,6 +1,9 @@
 //! A federation with a race on purpose, and one that breaks: `ictus verify` and `ictus up` must say so.
 
 use ictus::prelude::*;
+use time::{Beat, Ear, Guard, Stamped};
+
+mod time;
 
 /// Sends what no reaction should: a value that depends on physical time.
 #[reactor]
@@ -73,4 +76,4 @@ impl Counter {
     }
 }
 
-ictus::program![Racer, Faulty, Watcher, Counter];
+ictus::program![Racer, Faulty, Watcher, Counter, Beat, Ear, Guard, Stamped];
