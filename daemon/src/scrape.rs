@@ -1,5 +1,6 @@
 //! The read-only TCP listeners for Prometheus: one for each `metrics.listen` of the federations that are there.
 
+use std::collections::btree_map::Entry;
 use std::collections::{BTreeMap, BTreeSet};
 use std::convert::Infallible;
 use std::io;
@@ -59,7 +60,7 @@ impl Listeners {
         federation: &str,
         wanted: SocketAddr,
     ) -> io::Result<SocketAddr> {
-        if !self.0.contains_key(&wanted) {
+        if let Entry::Vacant(place) = self.0.entry(wanted) {
             let listener = std::net::TcpListener::bind(wanted)?;
             listener.set_nonblocking(true)?;
             let listener = TcpListener::from_std(listener)?;
@@ -71,7 +72,7 @@ impl Listeners {
                 federations,
                 task,
             };
-            self.0.insert(wanted, listener);
+            place.insert(listener);
         }
         for (address, listener) in &mut self.0 {
             if *address == wanted {

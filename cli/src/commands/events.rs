@@ -48,6 +48,7 @@ impl Events {
 }
 
 /// An event in words.
+#[expect(clippy::too_many_lines, reason = "an arm for each event")]
 pub(crate) fn describe(event: &Event) -> String {
     match event {
         Event::Started { member, pid, .. } => format!("{member} was started (pid {pid})"),
