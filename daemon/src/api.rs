@@ -163,6 +163,10 @@ pub enum ExitReason {
     PeerFailed,
     /// It could not join.
     NotJoined,
+    /// Its clock's error bound was greater than the plan allows.
+    Clock,
+    /// It had as many STP violations as the plan allows.
+    StpViolations,
     /// A signal killed it.
     Killed,
     /// It was never started.
@@ -181,6 +185,8 @@ impl ExitReason {
                 Ok(exit::RTI_LOST) => Self::RtiLost,
                 Ok(exit::PEER_FAILED) => Self::PeerFailed,
                 Ok(exit::NOT_JOINED) => Self::NotJoined,
+                Ok(exit::CLOCK) => Self::Clock,
+                Ok(exit::STP_VIOLATIONS) => Self::StpViolations,
                 Ok(_) | Err(_) => Self::Failed,
             },
             Ending::Killed { .. } => Self::Killed,
@@ -198,6 +204,8 @@ impl ExitReason {
             Self::RtiLost => "rti_lost",
             Self::PeerFailed => "peer_failed",
             Self::NotJoined => "not_joined",
+            Self::Clock => "clock",
+            Self::StpViolations => "stp_violations",
             Self::Killed => "killed",
             Self::NotStarted => "not_started",
             Self::Unknown => "unknown",
