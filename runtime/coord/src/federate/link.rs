@@ -603,15 +603,20 @@ impl Link {
         timeline: &Timeline,
         payload: impl FnOnce(&mut Vec<u8>),
     ) -> Option<usize> {
+        let mut bytes = 0;
+        let payload = |out: &mut Vec<u8>| {
+            let before = out.len();
+            payload(out);
+            bytes = out.len() - before;
+        };
         let at = timeline.at();
         self.told_at[node.index()] = at;
         let link = self.config.outputs[output.index()];
         let tag = at.delayed(link.delay);
         if link.physical {
             let out = self.peers.to(link.federate)?;
-            let before = out.len();
             wire::encode_peer_message(link.port_id, link.federate, None, out, payload);
-            return Some(out.len() - before);
+            return Some(bytes);
         }
         if self.silent || self.silent_at == Some(at) {
             if self.config.in_cycle {
@@ -624,13 +629,10 @@ impl Link {
         }
         if self.config.decentralized {
             let out = self.peers.to(link.federate)?;
-            let before = out.len();
             wire::encode_peer_message(link.port_id, link.federate, Some(tag), out, payload);
-            return Some(out.len() - before);
+            return Some(bytes);
         }
-        let before = self.out.len();
         wire::encode_tagged_message(link.port_id, link.federate, tag, &mut self.out, payload);
-        let bytes = self.out.len() - before;
         if let Some(through) = &mut self.not_needed_through {
             *through = (*through).min(tag);
         }
