@@ -594,7 +594,7 @@ impl Link {
         Measures::new(&list(upstreams), &list(downstreams))
     }
 
-    /// Sends the value of `output` and says how many bytes that took; not after the stop tag, nor past the end of time.
+    /// Sends the value of `output` and says how many payload bytes that took; not after the stop tag, nor past the end of time.
     #[inline]
     pub(super) fn send(
         &mut self,
