@@ -4,8 +4,9 @@ use std::path::PathBuf;
 use std::process::Stdio;
 use std::time::Duration;
 
+use ictus_coord::plan::Plan;
 use ictus_deploy::Checked;
-use ictusd::api::{Event, Happening, Outcome};
+use ictusd::api::{Event, Happening, Outcome, StartRequest};
 use ictusd::store::Directory;
 
 use crate::error::{CliError, Kind};
@@ -53,13 +54,21 @@ impl<'a> Runs<'a> {
         })
     }
 
-    /// Runs the federation once; gives the directory of what it left.
-    pub(crate) async fn federated(&mut self, trace: bool) -> Result<Directory, CliError> {
+    /// Runs the federation once, by a plan of it; gives the directory of what it left.
+    pub(crate) async fn federated(
+        &mut self,
+        plan: &Plan,
+        trace: bool,
+    ) -> Result<Directory, CliError> {
         let own = &self.checked.plan.federation;
         let name = format!("{own}.{}.{}", std::process::id(), self.names.len() + 1);
         // Asked for anew each time: one that has owned nothing for long may have ended.
         let client = self.session.daemon().await?;
-        let mut stream = client.start(&name, &request(self.checked, trace)).await?;
+        let request = StartRequest {
+            plan: plan.clone(),
+            ..request(self.checked, trace)
+        };
+        let mut stream = client.start(&name, &request).await?;
         self.names.push(name.clone());
         let outcome = async {
             while let Some(Happening { event, .. }) = stream.next().await? {

@@ -11,6 +11,7 @@ mod document;
 mod federation;
 mod lets;
 mod manifest;
+mod modes;
 pub mod offsets;
 mod plan;
 mod policy;
@@ -29,6 +30,7 @@ pub use check::{
 };
 pub use codes::explain;
 pub use manifest::COORDINATOR;
+pub use modes::OffsetOrigin;
 pub use offsets::Offsets;
 pub use problem::{Problem, Problems};
 pub use timing::TimingSpec;

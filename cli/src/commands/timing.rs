@@ -111,7 +111,7 @@ impl Timing {
             let mut result = Ok(());
             for run in 1..=number {
                 ui.progress("running", &format!("{run} of {number}"));
-                match runs.federated(false).await {
+                match runs.federated(&checked.plan, false).await {
                     Ok(directory) => directories.push(directory.timing()),
                     Err(error) => {
                         result = Err(error);

@@ -1,8 +1,10 @@
-//! `ictus verify`: the same logical trace in one process and federated.
+//! `ictus verify`: the same logical trace in one process, centralized and decentralized.
 
 use std::collections::BTreeMap;
+use std::fmt;
+use std::time::Duration;
 
-use clap::Args;
+use clap::{Args, ValueEnum};
 use ictus_deploy::Checked;
 use ictus_deploy::trace::{Record, TraceSet, Verdict, compare};
 use serde::Serialize;
@@ -10,20 +12,39 @@ use serde::Serialize;
 use crate::args::ManifestArgs;
 use crate::error::CliError;
 use crate::runs::Runs;
-use crate::session::{Session, checked};
+use crate::session::{Session, checked, count};
 use crate::ui::{Table, Ui, nanoseconds};
 
-/// Compare the logical trace of one process with that of the federation
+/// Compare the logical traces of one process and of the federation under each coordination
 ///
-/// Runs the whole program in one process, then the federation with RTI and sockets several times, and compares what
-/// every reaction did at every tag. The manifest needs a `timeout`.
+/// Runs the whole program in one process, then the federation with sockets, centralized and decentralized, and compares
+/// what every reaction did at every tag. What the manifest cannot run is left out. The manifest needs a `timeout`.
 #[derive(Debug, Args)]
 pub(crate) struct Verify {
     #[command(flatten)]
     manifest: ManifestArgs,
-    /// How often the federation is run
+    /// How often the federation is run in each mode
     #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=1000))]
     runs: u32,
+    /// What is compared with the first of them; left out, all that the manifest can run
+    #[arg(long, value_name = "MODE,...", value_enum, value_delimiter = ',')]
+    modes: Vec<Mode>,
+    /// Decentralized: what each connection adds to the offsets, in place of the manifest's [default: the manifest's
+    /// offsets, or 200 ms when it has none]
+    #[arg(long, value_name = "TIME", value_parser = crate::args::duration)]
+    stp_offset: Option<Duration>,
+}
+
+/// A way to run a federation.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, ValueEnum)]
+#[serde(rename_all = "snake_case")]
+enum Mode {
+    /// The whole program in one process
+    One,
+    /// Processes; the coordinator grants tags
+    Centralized,
+    /// Processes; clocks and offsets decide
+    Decentralized,
 }
 
 /// What was found.
@@ -32,20 +53,37 @@ struct Answer {
     federation: String,
     equal: u32,
     of: u32,
-    /// Of the run in one process.
+    /// What the others are compared with.
+    reference: Mode,
+    /// Of the reference.
     records_per_federate: BTreeMap<String, usize>,
-    /// Of the run in one process.
+    /// Of the reference.
     hash: String,
-    runs: Vec<Verdict>,
+    /// Where the offsets of decentralized runs come from, in words; absent without one.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    offsets: Option<String>,
+    runs: Vec<Run>,
+}
+
+/// A run and how it compares with the reference.
+#[derive(Debug, Serialize)]
+struct Run {
+    mode: Mode,
+    hash: String,
+    /// Messages that came too late.
+    violations: usize,
+    #[serde(flatten)]
+    verdict: Verdict,
 }
 
 impl Verify {
     pub(crate) fn run(&self, ui: &mut Ui) -> Result<(), CliError> {
         let session = Session::new()?;
         let checked = checked(ui, &self.manifest, true)?;
+        let modes = self.modes(ui, &checked)?;
         session.block_on(async {
             let mut runs = Runs::new(&session, &checked).await?;
-            let answer = self.compare(ui, &checked, &mut runs).await;
+            let answer = self.compare(ui, &checked, (&mut runs, &modes)).await;
             runs.remove(ui).await;
             let answer = answer?;
             ui.result(&answer, || answer.text())?;
@@ -59,47 +97,164 @@ impl Verify {
         })
     }
 
+    /// The modes asked for, or all that the manifest can run, the reference first.
+    fn modes(&self, ui: &mut Ui, checked: &Checked) -> Result<Vec<Mode>, CliError> {
+        let mut modes = Vec::new();
+        for mode in [Mode::One, Mode::Centralized, Mode::Decentralized] {
+            let asked = self.modes.contains(&mode);
+            if !self.modes.is_empty() && !asked {
+                continue;
+            }
+            match mode.obstacle(checked) {
+                None => modes.push(mode),
+                Some((why, hint)) if asked => {
+                    let message = format!("the federation cannot run {mode}: {why}");
+                    return Err(CliError::failed(message).hint(hint));
+                }
+                Some((why, _)) => ui.stage("left out", &format!("{mode}: {why}")),
+            }
+        }
+        let often = |mode: &Mode| if *mode == Mode::One { 1 } else { self.runs };
+        if modes.iter().map(often).fold(0, u32::saturating_add) < 2 {
+            let error = CliError::failed("there is only one run, so nothing to compare it with");
+            return Err(error.hint("`--runs 2`, or more of `--modes one,centralized,decentralized`"));
+        }
+        Ok(modes)
+    }
+
     async fn compare(
         &self,
         ui: &mut Ui,
         checked: &Checked,
-        runs: &mut Runs<'_>,
+        (runs, modes): (&mut Runs<'_>, &[Mode]),
     ) -> Result<Answer, CliError> {
-        ui.progress("running", "in one process");
-        let reference = read(&runs.in_one_process().await?, checked)?;
-        ui.stage("ran", &format!("in one process: {}", reference.hash()));
+        let span = self.stp_offset;
+        let span = span.map(|span| i64::try_from(span.as_nanos()).unwrap_or(i64::MAX));
+        let (decentralized, origin) = checked.decentralized(span);
+        let centralized = checked.centralized();
+        let mut reference: Option<TraceSet> = None;
         let mut answer = Answer {
             federation: checked.plan.federation.clone(),
             equal: 0,
-            of: self.runs,
-            records_per_federate: records(&reference),
-            hash: reference.hash(),
+            of: 0,
+            reference: modes.first().copied().unwrap_or(Mode::One),
+            records_per_federate: BTreeMap::new(),
+            hash: String::new(),
+            offsets: modes
+                .contains(&Mode::Decentralized)
+                .then(|| origin.to_string()),
             runs: Vec::new(),
         };
-        for number in 1..=self.runs {
-            ui.progress("running", &format!("federated, {number} of {}", self.runs));
-            let directory = runs.federated(true).await?;
-            let trace = read(&directory.trace(), checked)?;
-            let verdict = compare(&reference, &trace);
-            let said = describe(&verdict);
-            ui.stage(
-                "ran",
-                &format!("federated, {number} of {}: {said}", self.runs),
-            );
-            answer.equal += u32::from(matches!(verdict, Verdict::Equal { .. }));
-            answer.runs.push(verdict);
+        for mode in modes {
+            let often = if *mode == Mode::One { 1 } else { self.runs };
+            for number in 1..=often {
+                let (name, plan) = match mode {
+                    Mode::One => (mode.to_string(), None),
+                    Mode::Centralized => (format!("{mode}, {number} of {often}"), Some(&centralized)),
+                    Mode::Decentralized => (
+                        format!("{mode}, {number} of {often}, {origin}"),
+                        Some(&decentralized),
+                    ),
+                };
+                ui.progress("running", &name);
+                let directory = match plan {
+                    None => runs.in_one_process().await?,
+                    Some(plan) => runs.federated(plan, true).await?.trace(),
+                };
+                let traces = read(&directory, checked)?;
+                match &reference {
+                    None => {
+                        ui.stage("ran", &format!("{name}: {}", traces.hash()));
+                        answer.hash = traces.hash();
+                        answer.records_per_federate = traces.records_per_federate();
+                        reference = Some(traces);
+                    }
+                    Some(reference) => {
+                        let run = Run::new(*mode, reference, &traces);
+                        ui.stage("ran", &format!("{name}: {}", run.describe(answer.reference)));
+                        answer.of += 1;
+                        answer.equal += u32::from(matches!(run.verdict, Verdict::Equal { .. }));
+                        answer.runs.push(run);
+                    }
+                }
+            }
         }
         Ok(answer)
     }
 }
 
+impl Mode {
+    /// Why a manifest cannot be run so, and what to do about it.
+    fn obstacle(self, checked: &Checked) -> Option<(&'static str, &'static str)> {
+        match self {
+            Self::One => checked.one_program.is_none().then_some((
+                "its federates come from several programs",
+                "every federate must come from the same program, and none may be foreign",
+            )),
+            Self::Centralized => None,
+            Self::Decentralized => checked.plan.fast.then_some((
+                "`fast` runs ahead of physical time, by which it decides",
+                "remove `fast: true`",
+            )),
+        }
+    }
+}
+
+impl fmt::Display for Mode {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::One => "in one process",
+            Self::Centralized => "centralized",
+            Self::Decentralized => "decentralized",
+        })
+    }
+}
+
+impl Run {
+    fn new(mode: Mode, reference: &TraceSet, traces: &TraceSet) -> Self {
+        Self {
+            mode,
+            hash: traces.hash(),
+            violations: traces.federates.values().map(|one| one.tardy.len()).sum(),
+            verdict: compare(reference, traces),
+        }
+    }
+
+    fn describe(&self, reference: Mode) -> String {
+        let said = describe(&self.verdict, reference, self.mode);
+        match self.mode {
+            Mode::One | Mode::Centralized => said,
+            Mode::Decentralized => {
+                let violations = count(self.violations, "violation");
+                match self.verdict {
+                    Verdict::Equal { .. } => format!("{said}, {violations}"),
+                    Verdict::Different { .. } | Verdict::NotComparable { .. } => {
+                        format!("{violations}; {said}")
+                    }
+                }
+            }
+        }
+    }
+}
+
 impl Answer {
     fn text(&self) -> String {
-        let mut table = Table::new(&["FEDERATE", "RECORDS"]);
-        for (federate, records) in &self.records_per_federate {
-            table.row([federate.clone(), records.to_string()]);
+        let mut records = Table::new(&["FEDERATE", "RECORDS"]);
+        for (federate, number) in &self.records_per_federate {
+            records.row([federate.clone(), number.to_string()]);
         }
-        format!("{}\nequal {} of {}", table.text(), self.equal, self.of)
+        let mut runs = Table::new(&["RUN", "TRACE", "VIOLATIONS"]);
+        let reference = [self.reference.to_string(), self.hash.clone(), "-".to_owned()];
+        runs.row(reference);
+        for run in &self.runs {
+            let violations = match run.mode {
+                Mode::One | Mode::Centralized => "-".to_owned(),
+                Mode::Decentralized => run.violations.to_string(),
+            };
+            runs.row([run.mode.to_string(), run.hash.clone(), violations]);
+        }
+        let (equal, of) = (self.equal, self.of);
+        format!("{}\n\n{}\nequal {equal} of {of}", records.text(), runs.text())
     }
 }
 
@@ -129,15 +284,7 @@ fn read(directory: &std::path::Path, checked: &Checked) -> Result<TraceSet, CliE
     Ok(traces)
 }
 
-fn records(traces: &TraceSet) -> BTreeMap<String, usize> {
-    traces
-        .federates
-        .iter()
-        .map(|(name, trace)| (name.clone(), trace.records.len()))
-        .collect()
-}
-
-fn describe(verdict: &Verdict) -> String {
+fn describe(verdict: &Verdict, reference: Mode, mode: Mode) -> String {
     match verdict {
         Verdict::Equal { .. } => "equal".to_owned(),
         Verdict::Different {
@@ -145,7 +292,7 @@ fn describe(verdict: &Verdict) -> String {
             left,
             right,
         } => format!(
-            "different at federate `{federate}`\n  one process: {}\n  federated:   {}",
+            "different at federate `{federate}`\n  {reference}: {}\n  {mode}: {}",
             describe_record(left.as_ref()),
             describe_record(right.as_ref())
         ),

@@ -264,7 +264,12 @@ fn verify_finds_equal_traces_and_different_ones() {
     let equal = environment
         .run(&["verify", "equal.yaml", "--runs", "2"])
         .ok();
-    assert!(equal.out.ends_with("equal 2 of 2\n"), "{equal}");
+    // One process against two centralized and two decentralized runs.
+    assert!(equal.out.ends_with("equal 4 of 4\n"), "{equal}");
+    assert!(
+        equal.err.contains("200.0 ms per connection: equal, 0 violations"),
+        "{equal}"
+    );
     environment.write(
         "race.yaml",
         &with_timeout(
