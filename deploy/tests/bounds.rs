@@ -176,6 +176,24 @@ fn figures_are_those_of_the_histograms() {
     assert_eq!(sums.unwrap().band_ns, Some(45 * US));
 }
 
+/// A message that comes after the wait, at a tag that nobody had decided, has a slack of 0: its arrival tells how late it was.
+#[test]
+fn harmless_late_messages_count_for_the_offset() {
+    let mut measures = measures();
+    let peer = measures.federates[1].upstreams.get_mut("lidar").unwrap();
+    peer.slack = histogram(&[(900, 768), (100, 0)]);
+    peer.arrival = histogram(&[(900, 132), (100, 2_048)]);
+    let report = bounds_report(&plan(), &measures).unwrap();
+    let offset = report.federates[1]
+        .rows
+        .iter()
+        .find(|row| row.what == Measure::Offset);
+    let measured = offset.unwrap().measured.unwrap();
+    assert!(measured.p50_ns < 200 * US, "{measured:?}");
+    assert_eq!(measured.max_ns, 2_048 * US);
+    assert_eq!(offset.unwrap().margin_ns, Some((900 - 2_048) * US));
+}
+
 /// Nothing measured, nothing declared: rows without figures.
 #[test]
 fn nothing_measured_is_no_error() {

@@ -112,6 +112,7 @@ fn connections(plan: &Plan) -> String {
     for wire in &plan.connections {
         let after = match wire.after_ns {
             None => "-".to_owned(),
+            Some(0) if wire.physical => "0 s".to_owned(),
             Some(0) => "1 microstep".to_owned(),
             Some(ns) => nanoseconds(ns),
         };

@@ -117,7 +117,9 @@ impl Verify {
         let often = |mode: &Mode| if *mode == Mode::One { 1 } else { self.runs };
         if modes.iter().map(often).fold(0, u32::saturating_add) < 2 {
             let error = CliError::failed("there is only one run, so nothing to compare it with");
-            return Err(error.hint("`--runs 2`, or more of `--modes one,centralized,decentralized`"));
+            return Err(
+                error.hint("`--runs 2`, or more of `--modes one,centralized,decentralized`")
+            );
         }
         Ok(modes)
     }
@@ -150,7 +152,9 @@ impl Verify {
             for number in 1..=often {
                 let (name, plan) = match mode {
                     Mode::One => (mode.to_string(), None),
-                    Mode::Centralized => (format!("{mode}, {number} of {often}"), Some(&centralized)),
+                    Mode::Centralized => {
+                        (format!("{mode}, {number} of {often}"), Some(&centralized))
+                    }
                     Mode::Decentralized => (
                         format!("{mode}, {number} of {often}, {origin}"),
                         Some(&decentralized),
@@ -171,7 +175,10 @@ impl Verify {
                     }
                     Some(reference) => {
                         let run = Run::new(*mode, reference, &traces);
-                        ui.stage("ran", &format!("{name}: {}", run.describe(answer.reference)));
+                        ui.stage(
+                            "ran",
+                            &format!("{name}: {}", run.describe(answer.reference)),
+                        );
                         answer.of += 1;
                         answer.equal += u32::from(matches!(run.verdict, Verdict::Equal { .. }));
                         answer.runs.push(run);
@@ -244,7 +251,11 @@ impl Answer {
             records.row([federate.clone(), number.to_string()]);
         }
         let mut runs = Table::new(&["RUN", "TRACE", "VIOLATIONS"]);
-        let reference = [self.reference.to_string(), self.hash.clone(), "-".to_owned()];
+        let reference = [
+            self.reference.to_string(),
+            self.hash.clone(),
+            "-".to_owned(),
+        ];
         runs.row(reference);
         for run in &self.runs {
             let violations = match run.mode {
@@ -254,7 +265,11 @@ impl Answer {
             runs.row([run.mode.to_string(), run.hash.clone(), violations]);
         }
         let (equal, of) = (self.equal, self.of);
-        format!("{}\n\n{}\nequal {equal} of {of}", records.text(), runs.text())
+        format!(
+            "{}\n\n{}\nequal {equal} of {of}",
+            records.text(),
+            runs.text()
+        )
     }
 }
 

@@ -31,6 +31,7 @@ fn help() {
     check("help_logs", &environment, &["logs", "-h"]);
     check("help_timing", &environment, &["timing", "-h"]);
     check("help_verify", &environment, &["verify", "-h"]);
+    check("help_plan", &environment, &["plan", "-h"]);
 }
 
 #[test]
@@ -79,6 +80,58 @@ fn mistakes_of_a_manifest() {
         "verify_needs_a_timeout",
         &environment,
         &["verify", "-q", "endless.yaml"],
+    );
+}
+
+const CHAIN: &str = "\
+ictus: v1
+federation: chain
+coordination: COORDINATION
+programs: { acc: { package: acc } }
+timeout: 10 s
+bounds:
+  launch_lag: 200 us
+  latency: 600 us
+  clock_error: 100 us
+  links:
+    planner -> brake: { launch_lag: 2 ms, latency: 3 ms, clock_error: 500 us }
+federates:
+  lidar: { class: Lidar }
+  planner: { class: Planner }
+  brake: { class: Brake, on_failure: continue }
+  logger: { class: Logger, stp_offset: 2 ms }
+connections:
+  - { from: lidar.points, to: planner.points }
+  - { from: planner.command, to: [brake.command, logger.command] }
+  - { from: brake.state, to: planner.state, after: 20 ms }
+  - { from: brake.raw, to: logger.raw, physical: true, after: 0 s }
+";
+
+/// Nothing is built: what the programs would say of themselves plays no part in offsets.
+#[test]
+fn plans_with_their_offsets() {
+    let environment = Environment::new();
+    fs::create_dir(environment.path("acc")).unwrap();
+    environment.write("acc/Cargo.toml", "");
+    for coordination in ["decentralized", "centralized"] {
+        let text = CHAIN.replace("COORDINATION", coordination);
+        environment.write("chain.yaml", &text);
+        let name = format!("plan_{coordination}");
+        check(&name, &environment, &["plan", "--no-build", "chain.yaml"]);
+    }
+    let said = environment.run(&["plan", "--no-build", "chain.yaml", "-o", "json"]);
+    let answer: serde_json::Value = serde_json::from_str(&said.ok().out).unwrap();
+    assert_eq!(answer["plan"]["connections"][5], serde_json::Value::Null);
+    assert_eq!(answer["plan"]["federates"][2]["on_failure"], "continue");
+    assert_eq!(answer["offsets"]["federates"][2]["required_ns"], 6_400_000);
+    let cycle = CHAIN
+        .replace("COORDINATION", "decentralized")
+        .replace("20 ms", "2 ms");
+    environment.write("cycle.yaml", &cycle);
+    check(
+        "plan_cycle",
+        &environment,
+        &["plan", "--no-build", "cycle.yaml"],
     );
 }
 

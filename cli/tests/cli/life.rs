@@ -267,7 +267,9 @@ fn verify_finds_equal_traces_and_different_ones() {
     // One process against two centralized and two decentralized runs.
     assert!(equal.out.ends_with("equal 4 of 4\n"), "{equal}");
     assert!(
-        equal.err.contains("200.0 ms per connection: equal, 0 violations"),
+        equal
+            .err
+            .contains("200.0 ms per connection: equal, 0 violations"),
         "{equal}"
     );
     environment.write(
@@ -295,6 +297,93 @@ fn verify_finds_equal_traces_and_different_ones() {
             .starts_with("[]"),
         "no run is left"
     );
+}
+
+/// Bounds that hold on any machine; the one of the clock does not matter on one host.
+const BOUNDS: &str = "\
+coordination: decentralized
+bounds: { launch_lag: 2 s, latency: 1 s, clock_error: 0 s }
+";
+
+#[test]
+fn verify_runs_the_modes_that_it_is_asked_for() {
+    let environment = pair();
+    environment.write("pair.yaml", &with_timeout(&format!("{PAIR}{BOUNDS}")));
+    let said = environment.run(&[
+        "verify",
+        "pair.yaml",
+        "--modes",
+        "decentralized,one",
+        "-o",
+        "json",
+    ]);
+    let answer: Value = serde_json::from_str(&said.ok().out).unwrap();
+    assert_eq!(answer["reference"], "one", "{answer}");
+    assert_eq!(answer["offsets"], "offsets of the manifest", "{answer}");
+    assert_eq!(answer["of"], 1, "{answer}");
+    let run = &answer["runs"][0];
+    assert_eq!(
+        (&run["mode"], &run["violations"]),
+        (&"decentralized".into(), &0.into()),
+        "{answer}"
+    );
+    assert_eq!(run["hash"], answer["hash"], "{answer}");
+    let alone = environment.run(&["verify", "pair.yaml", "--modes", "centralized"]);
+    assert!(alone.err.contains("nothing to compare it with"), "{alone}");
+    environment.write("fast.yaml", &with_timeout(&format!("{PAIR}fast: true\n")));
+    let fast = environment.run(&["verify", "fast.yaml"]).ok();
+    assert!(
+        fast.err.contains("left out   decentralized: `fast`"),
+        "{fast}"
+    );
+    assert!(fast.out.ends_with("equal 1 of 1\n"), "{fast}");
+    let fast = environment.run(&["verify", "fast.yaml", "--modes", "one,decentralized"]);
+    assert!(fast.err.contains("cannot run decentralized"), "{fast}");
+}
+
+/// What was measured stays until `down`, so nothing has to be waited for.
+#[test]
+fn timing_shows_declared_and_measured_bounds_of_a_decentralized_run() {
+    let environment = pair();
+    environment.write("pair.yaml", &with_timeout(&format!("{PAIR}{BOUNDS}")));
+    let mut up = environment.start(&["up", "pair.yaml", "--attach"]);
+    up.wait_for("healthy");
+    let (code, rest) = up.end();
+    assert_eq!(code, 0, "{rest}");
+    let said = environment.run(&["timing", "-o", "json"]).ok();
+    let answer: Value = serde_json::from_str(&said.out).unwrap();
+    let [source, sink] = [0, 1].map(|index| &answer["bounds"]["federates"][index]);
+    assert_eq!(source["rows"][0]["what"], "launch_lag", "{answer}");
+    assert_eq!(source["rows"][0]["measured"]["count"], 30, "{answer}");
+    assert_eq!(sink["offset_ns"], 2_999_000_000_i64, "{answer}");
+    assert_eq!(sink["violations"], 0, "{answer}");
+    assert!(sink["rows"][0]["margin_ns"].is_i64(), "{answer}");
+    let table = environment.run(&["timing"]).ok();
+    assert!(
+        table.out.contains("\nsink: S 2999.0, required 2999.0;"),
+        "{table}"
+    );
+    let suggested = environment.run(&["timing", "--suggest"]).ok().out;
+    let (pair, _) = BOUNDS.split_once("bounds").unwrap();
+    environment.write("suggested.yaml", &format!("{PAIR}{pair}{suggested}"));
+    let checked = environment.run(&["check", "--no-build", "suggested.yaml"]);
+    assert!(
+        checked.err.contains("has no `clock_error`"),
+        "only the clock was not measured: {checked}"
+    );
+    let text = suggested.replace("# clock_error: not measured", "clock_error: 0 s");
+    environment.write("suggested.yaml", &format!("{PAIR}{pair}{text}"));
+    environment
+        .run(&["check", "--no-build", "suggested.yaml"])
+        .ok();
+}
+
+#[test]
+fn centralized_federations_have_no_bounds_to_suggest() {
+    let environment = pair();
+    environment.run(&["up", "pair.yaml"]).ok();
+    let said = environment.run(&["timing", "--suggest"]);
+    assert!(said.err.contains("coordinated centrally"), "{said}");
 }
 
 #[test]

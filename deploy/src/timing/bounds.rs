@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::fmt;
 
-use ictus_coord::measure::Histogram;
+use ictus_coord::measure::{Histogram, Upstream};
 use ictus_coord::plan::{Bounds, ConnectionPlan, Coordination, Plan};
 use ictus_coord::report::{FederateMeasures, FederationMeasures};
 use ictus_coord::stp::{self, Link};
@@ -254,7 +254,9 @@ impl<'a> Survey<'a> {
         let upstream = self.of(pair.to).and_then(|known| known.upstreams.get(name));
         let (bounds, band) = (declared(pair), self.band(pair));
         let wait = self.wait(pair);
-        let needed = upstream.and_then(|it| needed(wait, &it.slack, &it.lateness));
+        let after = pair.wires.iter().map(|wire| wire.after_ns.unwrap_or(0));
+        let base = self.offset(pair.from) - after.min().unwrap_or(0);
+        let needed = upstream.and_then(|it| needed(wait, base, it));
         let slack = upstream.and_then(|it| {
             let at = |q: f64| it.slack.quantile(q).as_nanos();
             (!it.slack.is_empty()).then(|| Spread {
@@ -366,12 +368,19 @@ fn declared(pair: &Pair<'_>) -> Option<Bounds> {
 }
 
 /// How long after their tags' times messages came, when the receiver waits so long: `wait` less the slack of those in time,
-/// `wait` and the lateness of the others.
+/// `wait` and the lateness of the others. Slack ends at 0 for one that came after the wait but harmed nobody; `base` and
+/// its arrival tell how late it was.
 #[expect(
     clippy::cast_precision_loss,
     reason = "a share of counts; 2^53 messages are out of reach"
 )]
-fn needed(wait: i64, slack: &Histogram, lateness: &Histogram) -> Option<Spread> {
+fn needed(wait: i64, base: i64, upstream: &Upstream) -> Option<Spread> {
+    let Upstream {
+        slack,
+        lateness,
+        arrival,
+        ..
+    } = upstream;
     let (early, late) = (slack.count(), lateness.count());
     let count = early.saturating_add(late);
     if count == 0 {
@@ -380,18 +389,26 @@ fn needed(wait: i64, slack: &Histogram, lateness: &Histogram) -> Option<Spread> 
     let at = |q: f64| {
         let rank = q * count as f64;
         if rank <= early as f64 {
-            let share = 1.0 - rank / early as f64;
-            wait.saturating_sub(slack.quantile(share).as_nanos())
+            let share = rank / early as f64;
+            let by_slack = wait.saturating_sub(slack.quantile(1.0 - share).as_nanos());
+            let by_arrival = base.saturating_add(arrival.quantile(share).as_nanos());
+            if by_slack == wait {
+                wait.max(by_arrival)
+            } else {
+                by_slack
+            }
         } else {
             let share = (rank - early as f64) / late as f64;
             wait.saturating_add(lateness.quantile(share).as_nanos())
         }
     };
+    let p50_ns = at(0.5);
+    let p99_ns = at(0.99).max(p50_ns);
     Some(Spread {
         count,
-        p50_ns: at(0.5),
-        p99_ns: at(0.99),
-        max_ns: at(1.0),
+        p50_ns,
+        p99_ns,
+        max_ns: at(1.0).max(p99_ns),
     })
 }
 

@@ -30,7 +30,7 @@ use crate::mutants::Mutant;
 use crate::payload::{FederateExecutor, PayloadError};
 use crate::wire::{DecodeError, RejectReason};
 use ictus_core::{
-    ActionId, Admission, Delay, Duration, Effects, LogicalTime, NodeId, NodeKind, OutputId,
+    ActionId, Admission, Delay, Duration, Effects, NodeId, NodeKind, OutputId,
     PhysicalTime, Program, Progress, Tag, Timeline, ValueId,
 };
 use join::Phase;
@@ -266,8 +266,10 @@ pub struct Federate {
     measures: Measures,
     /// Since when a grant has been missing, under centralized coordination.
     asked: Option<PhysicalTime>,
-    /// Receivers of messages that were written since the last poll, with the logical time at which they were.
-    launches: Vec<(u16, LogicalTime)>,
+    /// Receivers of messages that were written since the last poll, with the time from which their launch lag counts.
+    launches: Vec<(u16, PhysicalTime)>,
+    /// When the current tag was begun, or might have been: the end of its offset, if that is earlier.
+    due: PhysicalTime,
     /// Everything that had come when the clock showed this has been received.
     looked_at: PhysicalTime,
     /// The clock at the last poll.
@@ -307,6 +309,7 @@ impl Federate {
             measures: link.as_ref().map_or_else(Measures::default, Link::measures),
             asked: None,
             launches: Vec::new(),
+            due: PhysicalTime::NEVER,
             looked_at: PhysicalTime::NEVER,
             now: PhysicalTime::NEVER,
             unexplained: None,
@@ -544,6 +547,9 @@ impl Federate {
 
     /// Notes the lag of the tag just begun, and what time has decided about its inputs.
     fn note_begun(&mut self, now: PhysicalTime) {
+        let offset = self.link.as_ref().map(|link| link.config.stp_offset);
+        let time = self.timeline.at().time.as_physical();
+        self.due = now.min(time.saturating_add(offset.unwrap_or(Duration::ZERO)));
         if !self.config.fast {
             let news = self.measures.tag_begun(now, self.timeline.at());
             self.events.extend(news.map(FederateEvent::Lag));
@@ -737,7 +743,7 @@ impl Federate {
         let receiver = link.config.outputs[output.index()].federate;
         self.measures.sent(receiver, bytes);
         if !self.config.fast {
-            self.launches.push((receiver, self.timeline.at().time));
+            self.launches.push((receiver, self.due));
         }
     }
 
@@ -747,12 +753,7 @@ impl Federate {
         if self.launches.is_empty() {
             return;
         }
-        let offset = self
-            .link
-            .as_ref()
-            .map_or(Duration::ZERO, |link| link.config.stp_offset);
-        for (receiver, time) in self.launches.drain(..) {
-            let due = time.as_physical().saturating_add(offset);
+        for (receiver, due) in self.launches.drain(..) {
             self.measures.launch_lag(receiver, now.since(due));
         }
     }

@@ -138,6 +138,13 @@ impl Federate {
             .time
             .as_physical()
             .saturating_add(input.stp_offset);
+        let origin = message
+            .tag
+            .time
+            .as_physical()
+            .saturating_add(-delay(input.delay));
+        let arrival = now.since(origin.saturating_add(input.sender_offset));
+        self.measures.arrival(input.federate, arrival);
         match self.timeline.admit(message.input, message.tag, value) {
             Admission::Queued { tag } => {
                 if known_by_order {
@@ -156,13 +163,6 @@ impl Federate {
             }
         }
         self.measures.slack(input.federate, by.since(now));
-        let origin = message
-            .tag
-            .time
-            .as_physical()
-            .saturating_add(-delay(input.delay));
-        let arrival = now.since(origin.saturating_add(input.sender_offset));
-        self.measures.arrival(input.federate, arrival);
         Ok(())
     }
 
