@@ -64,7 +64,7 @@ use crate::observe::{Memory, Observer};
 use crate::reactor::Reactions;
 use ictus_coord::describe::InstanceRequest;
 use ictus_coord::federate::{Federate, FederateConfig, Outcome, Poll};
-use ictus_coord::plan::{ConnectionPlan, Endpoint, FederatePlan, Plan};
+use ictus_coord::plan::{ConnectionPlan, Coordination, Endpoint, FederatePlan, Plan};
 use ictus_coord::{FederateExecutor, PayloadError};
 use ictus_core::{
     ActionId, Duration, Effects, Executor, InputId, NodeId, OutputId, PhysicalTime, SlotId, Tag,
@@ -233,6 +233,18 @@ impl Federation {
     #[must_use]
     pub fn timeout(mut self, timeout: Duration) -> Self {
         self.plan.timeout_ns = Some(timeout.as_nanos());
+        self
+    }
+
+    /// Leaves coordination to time: each federate waits `offset` for what may still come.
+    ///
+    /// No seed's network is bound to it, so that messages can be tardy, and traces then differ from that of one program.
+    #[must_use]
+    pub fn decentralized(mut self, offset: Duration) -> Self {
+        self.plan.coordination = Coordination::Decentralized;
+        for federate in &mut self.plan.federates {
+            federate.stp_offset_ns = offset.as_nanos();
+        }
         self
     }
 
