@@ -28,6 +28,7 @@ use std::process::ExitCode;
 use std::sync::Arc;
 
 mod error;
+mod report;
 
 pub use error::RunError;
 
@@ -631,55 +632,6 @@ impl Runner<'_> {
 
     fn elapsed_ns(&self, tag: Tag) -> i64 {
         tag.time.since(self.start.time).as_nanos()
-    }
-
-    fn report_progress(&mut self, now: PhysicalTime) {
-        if !self.status.enabled() || now.since(self.reported_at) < PROGRESS_EVERY {
-            return;
-        }
-        self.reported_at = now;
-        self.bodies.flush_observed();
-        self.report();
-    }
-
-    /// Says how far the federate is and what it measured, as far as there is room for it.
-    fn report(&mut self) {
-        if self.start == Tag::NEVER {
-            return;
-        }
-        let (counters, bodies) = (self.federate.counters(), self.bodies.counters());
-        let at = self.federate.timeline().at();
-        self.status.say(&FederateStatus::Progress {
-            federate: self.name.to_owned(),
-            elapsed_ns: self.elapsed_ns(at),
-            microstep: at.microstep,
-            tags: counters.tags,
-            reactions: bodies.reactions,
-            sent: counters.sent,
-            received: counters.received,
-            deadlines_missed: bodies.deadlines_missed,
-        });
-        let measures = self.federate.measures_mut();
-        let lateness = self.bodies.deadline_lateness();
-        measures.executed(bodies.reactions, bodies.watchdogs_fired, lateness);
-        self.status.say_measures(self.name, measures);
-        self.report_clock();
-    }
-
-    fn report_clock(&mut self) {
-        let federate = self.name.to_owned();
-        if let Some(by) = self.sync.take_step() {
-            let by_ns = by.as_nanos();
-            drop(writeln!(
-                io::stderr(),
-                "ictus: federate {federate}: a clock was stepped by {by}"
-            ));
-            self.status
-                .say(&FederateStatus::ClockStep { federate, by_ns });
-        }
-        let federate = self.name.to_owned();
-        let clock = self.sync.status();
-        self.status.say(&FederateStatus::Clock { federate, clock });
     }
 
     /// After the last tag: the last bytes, the trace's end, the last status line, the exit code.
