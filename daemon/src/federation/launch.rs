@@ -143,3 +143,59 @@ fn federate_args(
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use ictus_coord::plan::{ClockPlan, FederatePlan, Plan};
+    use ictus_deploy::{Settings, TimingSpec};
+    use ictus_rti::{Command, Options};
+
+    use super::*;
+
+    /// What the plan asks of the RTI, it is told in options that it has.
+    #[test]
+    fn the_rti_is_told_what_the_plan_says() {
+        let federate = |on_failure| FederatePlan {
+            on_failure,
+            ..FederatePlan::default()
+        };
+        let plan = Plan {
+            authentication: true,
+            wire: Wire::V0_13,
+            clock: ClockPlan {
+                sync: ClockSync::On,
+                period_ns: 5_000_000,
+                trials: 7,
+                ..ClockPlan::default()
+            },
+            federates: vec![
+                federate(OnFailure::StopFederation),
+                federate(OnFailure::Continue),
+            ],
+            ..Plan::default()
+        };
+        let run = |id| FederateRun {
+            id,
+            name: format!("f{id}"),
+            executable: "/bin/f".into(),
+            kind: FederateKind::Ours,
+            env: BTreeMap::new(),
+        };
+        let request = StartRequest {
+            manifest: "/f.yaml".into(),
+            cwd: "/".into(),
+            plan,
+            federates: vec![run(0), run(1)],
+            settings: Settings::default(),
+            timing: TimingSpec::default(),
+            trace: false,
+        };
+        let args = rti_args(&request, "x");
+        assert_eq!(
+            args.join(" "),
+            "rti -i x -n 2 -p 0 -c on period 5000000 exchanges-per-interval 7 -a --wire 0.13 --continue 1"
+        );
+        let options = args.into_iter().skip(1).map(Into::into);
+        assert!(matches!(Options::parse(options), Ok(Command::Run(_))));
+    }
+}
