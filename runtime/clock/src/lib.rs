@@ -7,4 +7,4 @@ mod socket;
 
 pub use discipline::{Discipline, Sources};
 pub use host::{HostClock, Skew, StepWatch};
-pub use socket::{Arrival, ProbeSocket, Stamps};
+pub use socket::{Arrival, Departure, ProbeSocket, Sent, Stamps};

@@ -6,11 +6,13 @@ use std::os::fd::{AsFd, AsRawFd, BorrowedFd};
 
 use ictus_coord::clock::LONGEST;
 use ictus_core::{Duration, PhysicalTime};
+use nix::libc;
 use nix::sys::socket::sockopt::Timestamping;
 use nix::sys::socket::{
     ControlMessageOwned, MsgFlags, SockaddrStorage, TimestampingFlag, Timestamps, recvmsg,
     setsockopt,
 };
+use nix::sys::time::TimeSpec;
 
 use crate::host::{HostClock, system};
 
@@ -30,11 +32,27 @@ pub enum Stamps {
 ///
 /// With [`Stamps::Kernel`] the time a datagram waits for its reader to be scheduled, tens of microseconds on an idle machine and
 /// milliseconds on a busy one, counts no longer as time on its way. When it was *sent* is read by the sender just before:
-/// T1 says so in itself, before it leaves, and what T3 does alike keeps both ways alike.
+/// what the
+/// kernel knows of that, it knows afterwards ([`ProbeSocket::departed`]).
 #[derive(Debug)]
 pub struct ProbeSocket {
     socket: UdpSocket,
     stamps: Stamps,
+    /// Datagrams sent, as the kernel counts them.
+    sent: u32,
+}
+
+/// A datagram that was sent.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Sent(u32);
+
+/// When a datagram left.
+#[derive(Clone, Copy, Debug)]
+pub struct Departure {
+    /// Which.
+    pub sent: Sent,
+    /// When it left, or a little earlier.
+    pub when: PhysicalTime,
 }
 
 /// A datagram.
@@ -72,12 +90,19 @@ impl ProbeSocket {
         let socket = UdpSocket::bind((address, port))?;
         socket.set_nonblocking(true)?;
         let flags = TimestampingFlag::SOF_TIMESTAMPING_RX_SOFTWARE
-            | TimestampingFlag::SOF_TIMESTAMPING_SOFTWARE;
+            | TimestampingFlag::SOF_TIMESTAMPING_TX_SOFTWARE
+            | TimestampingFlag::SOF_TIMESTAMPING_SOFTWARE
+            | TimestampingFlag::SOF_TIMESTAMPING_OPT_ID
+            | TimestampingFlag::SOF_TIMESTAMPING_OPT_TSONLY;
         let stamps = match wanted {
             Stamps::Kernel if setsockopt(&socket, Timestamping, &flags).is_ok() => Stamps::Kernel,
             Stamps::Kernel | Stamps::Reader => Stamps::Reader,
         };
-        Ok(Self { socket, stamps })
+        Ok(Self {
+            socket,
+            stamps,
+            sent: 0,
+        })
     }
 
     /// Who says when a datagram came.
@@ -96,8 +121,42 @@ impl ProbeSocket {
     }
 
     /// Sends a datagram. One that cannot be sent is as good as lost on its way.
-    pub fn send(&self, to: SocketAddr, bytes: &[u8]) {
-        let _lost = self.socket.send_to(bytes, to);
+    pub fn send(&mut self, to: SocketAddr, bytes: &[u8]) -> Option<Sent> {
+        self.socket.send_to(bytes, to).ok()?;
+        let sent = Sent(self.sent);
+        self.sent = self.sent.wrapping_add(1);
+        Some(sent)
+    }
+
+    /// What the kernel has to say, by `clock`, of one that was sent; to be asked until it says `None`, else the socket stays
+    /// ready.
+    pub fn departed(&mut self, clock: &HostClock) -> Option<Departure> {
+        let mut byte = [0; 1];
+        let mut parts = [IoSliceMut::new(&mut byte)];
+        let mut control = nix::cmsg_space!(Timestamps, libc::sock_extended_err, [u8; 64]);
+        let flags = MsgFlags::MSG_ERRQUEUE | MsgFlags::MSG_DONTWAIT;
+        let descriptor = self.socket.as_raw_fd();
+        loop {
+            let message =
+                recvmsg::<SockaddrStorage>(descriptor, &mut parts, Some(&mut control), flags)
+                    .ok()?;
+            // In this order, so that the time between the two makes it earlier.
+            let (now, read_at) = (clock.now(), system());
+            let (mut left, mut sent) = (None, None);
+            for part in message.cmsgs().ok()? {
+                match part {
+                    ControlMessageOwned::ScmTimestampsns(stamps) => left = Some(stamps.system),
+                    ControlMessageOwned::Ipv4RecvErr(error, _)
+                    | ControlMessageOwned::Ipv6RecvErr(error, _) => sent = Some(error.ee_data),
+                    _ => {}
+                }
+            }
+            if let (Some(left), Some(sent)) = (left, sent) {
+                let sent = Sent(sent);
+                let when = now + -since(read_at, left);
+                return Some(Departure { sent, when });
+            }
+        }
     }
 
     /// The next datagram; `None` when there is none.
@@ -140,20 +199,12 @@ impl ProbeSocket {
                 _ => None,
             })
         });
-        let waited = stamp.map_or(0, |stamp| {
-            let stamp = stamp.tv_sec() * 1_000_000_000 + stamp.tv_nsec();
-            read_at.saturating_sub(stamp)
-        });
-        let waited = if (0..OLDEST).contains(&waited) {
-            waited
-        } else {
-            0
-        };
+        let waited = stamp.map_or(Duration::ZERO, |stamp| since(read_at, stamp));
         Ok(from.map(|from| Arrival {
             from,
             bytes,
             length,
-            waited: Duration::from_nanos(waited),
+            waited,
         }))
     }
 }
@@ -162,6 +213,14 @@ impl AsFd for ProbeSocket {
     fn as_fd(&self) -> BorrowedFd<'_> {
         self.socket.as_fd()
     }
+}
+
+/// The time since a stamp; none when it makes no sense.
+fn since(now: i64, stamp: TimeSpec) -> Duration {
+    let stamp = stamp.tv_sec() * 1_000_000_000 + stamp.tv_nsec();
+    let passed = now.saturating_sub(stamp);
+    let sense = (0..OLDEST).contains(&passed);
+    Duration::from_nanos(if sense { passed } else { 0 })
 }
 
 fn address(storage: &SockaddrStorage) -> Option<SocketAddr> {
@@ -181,12 +240,12 @@ mod tests {
     fn the_kernel_knows_how_long_a_datagram_has_waited() {
         let local = IpAddr::V4(Ipv4Addr::LOCALHOST);
         let bind = |stamps| ProbeSocket::bind(local, 0, stamps).unwrap();
-        let (sender, reader) = (bind(Stamps::Reader), bind(Stamps::Kernel));
+        let (mut sender, reader) = (bind(Stamps::Kernel), bind(Stamps::Kernel));
         assert!(reader.receive().unwrap().is_none());
         let to = SocketAddr::new(local, reader.port().unwrap());
         let clock = HostClock::raw();
         let before = clock.now();
-        sender.send(to, &[7; 20]);
+        let which = sender.send(to, &[7; 20]);
         let sent = clock.now();
         while clock.now() < sent + Duration::from_millis(3) {}
         let arrival = reader.receive().unwrap().unwrap();
@@ -200,5 +259,11 @@ mod tests {
             );
         }
         assert!(arrival.came(&clock) >= before);
+        if sender.stamps() == Stamps::Kernel {
+            let departure = sender.departed(&clock).unwrap();
+            assert_eq!(Some(departure.sent), which);
+            assert!(departure.when <= sent, "it left while it was sent");
+        }
+        assert!(sender.departed(&clock).is_none());
     }
 }

@@ -22,7 +22,7 @@ mod interval;
 mod prober;
 mod servo;
 
-pub use datagram::{Datagram, FromFederate, LONGEST};
+pub use datagram::{Datagram, Encoded, FromFederate, LONGEST};
 pub use follower::{Follower, Heard};
 pub use interval::Interval;
 pub use prober::{Prober, Transmit};

@@ -568,6 +568,13 @@ impl Rti {
         self.prober.as_mut()?.poll_transmit(now)
     }
 
+    /// T1 to a federate left when the clock showed `when` or later.
+    pub fn probe_left(&mut self, federate: FederateId, when: PhysicalTime) {
+        if let Some(prober) = &mut self.prober {
+            prober.left(federate, when);
+        }
+    }
+
     /// The prober, while clocks are compared continuously.
     #[must_use]
     pub const fn prober(&self) -> Option<&Prober> {

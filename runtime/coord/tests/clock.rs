@@ -36,17 +36,21 @@ proptest! {
     #[test]
     fn datagrams_round_trip(nanos: i64, federate: u16, echo: Option<i64>) {
         let time = PhysicalTime::from_nanos(nanos);
-        for datagram in [Datagram::T1(time), Datagram::T4(time), Datagram::CodedProbe(time)] {
+        for datagram in [
+            Datagram::T1(time),
+            Datagram::T4 { came: time, left: echo.map(PhysicalTime::from_nanos) },
+            Datagram::CodedProbe(time),
+        ] {
             prop_assert_eq!(Datagram::decode(&datagram.encode()), Some(datagram));
         }
         let answer = FromFederate { federate, echo: echo.map(PhysicalTime::from_nanos) };
-        let (bytes, length) = answer.encode();
-        prop_assert_eq!(FromFederate::decode(&bytes[..length]), Some(answer));
+        let bytes = answer.encode();
+        prop_assert_eq!(FromFederate::decode(&bytes), Some(answer));
     }
 
     #[test]
     fn strange_datagrams_are_none(bytes in proptest::collection::vec(any::<u8>(), 0..24)) {
-        if bytes.len() != 9 {
+        if bytes.len() != 9 && bytes.len() != 17 {
             prop_assert_eq!(Datagram::decode(&bytes), None);
         }
         if bytes.len() != 3 && bytes.len() != 11 {
@@ -68,17 +72,17 @@ proptest! {
             now += later;
             let time = PhysicalTime::from_nanos(if kind == 4 { EPOCH + time % SECOND } else { time });
             let bytes = match kind {
-                0 => Datagram::T4(time).encode(),
+                0 => Datagram::T4 { came: time, left: None }.encode(),
                 1 => Datagram::CodedProbe(time).encode(),
                 2 | 4 => Datagram::T1(time).encode(),
-                _ => time.as_nanos().to_le_bytes().repeat(2)[..9].try_into().unwrap(),
+                _ => Datagram::T4 { came: time, left: Some(at(now)) }.encode(),
             };
             match follower.receive(address(port), &bytes, at(now)) {
                 Heard::Nothing => {}
                 Heard::Answer { datagram, .. } => {
                     follower.answered(at(now));
-                    let (bytes, length) = datagram.encode();
-                    prober.receive(address(7), &bytes[..length], time);
+                    let bytes = datagram.encode();
+                    prober.receive(address(7), &bytes, time);
                 }
                 Heard::Complete(exchange, survived) => {
                     servo.take(at(now), exchange, survived);
@@ -245,13 +249,19 @@ fn an_exchange_on_the_wire_is_lfs() {
     let Heard::Answer { to, datagram } = heard else {
         panic!("{heard:?}");
     };
-    let (bytes, length) = datagram.encode();
-    assert_eq!((to, &bytes[..length]), (address(9), &[20, 0, 0][..]));
+    let bytes = datagram.encode();
+    assert_eq!((to, &bytes[..]), (address(9), &[20, 0, 0][..]));
     follower.answered(at(600));
-    prober.receive(address(7), &bytes[..length], at(1_000));
+    prober.receive(address(7), &bytes, at(1_000));
     // What is sent between them is what is between the readings, whenever T3 came.
     let (t4, probe) = (sent(&mut prober, 1_400), sent(&mut prober, 1_450));
-    assert_eq!(Datagram::decode(&t4.bytes), Some(Datagram::T4(at(1_000))));
+    assert_eq!(
+        Datagram::decode(&t4.bytes),
+        Some(Datagram::T4 {
+            came: at(1_000),
+            left: None
+        })
+    );
     assert_eq!(
         Datagram::decode(&probe.bytes),
         Some(Datagram::CodedProbe(at(1_050)))
@@ -286,7 +296,11 @@ fn spacing_that_did_not_survive_is_said() {
         let t1 = sent(&mut prober, 0);
         follower.receive(address(9), &t1.bytes, at(500));
         follower.answered(at(600));
-        let t4 = Datagram::T4(at(1_000)).encode();
+        let t4 = Datagram::T4 {
+            came: at(1_000),
+            left: None,
+        }
+        .encode();
         let probe = Datagram::CodedProbe(at(1_050)).encode();
         follower.receive(address(9), &t4, at(2_000));
         let heard = follower.receive(address(9), &probe, at(r5));
@@ -374,8 +388,8 @@ fn what_answers_an_earlier_exchange_is_not_taken() {
     follower.answered(at(600));
     prober.handle_timeout(at(SECOND));
     let second = sent(&mut prober, SECOND);
-    let (bytes, length) = late.encode();
-    prober.receive(address(7), &bytes[..length], at(SECOND + 10));
+    let bytes = late.encode();
+    prober.receive(address(7), &bytes, at(SECOND + 10));
     assert!(
         prober.poll_transmit(at(SECOND + 10)).is_none(),
         "it repeats another T1"
@@ -383,11 +397,44 @@ fn what_answers_an_earlier_exchange_is_not_taken() {
     follower.receive(address(9), &second.bytes, at(SECOND + 20));
     follower.answered(at(SECOND + 30));
     assert_eq!(follower.incomplete(), 1);
-    let t4 = Datagram::T4(at(700)).encode();
+    let t4 = Datagram::T4 {
+        came: at(700),
+        left: None,
+    }
+    .encode();
     let probe = Datagram::CodedProbe(at(750)).encode();
     follower.receive(address(9), &t4, at(SECOND + 40));
     assert_eq!(
         follower.receive(address(9), &probe, at(SECOND + 50)),
         Heard::Nothing
     );
+}
+
+#[test]
+fn when_datagrams_left_is_known_afterwards() {
+    for echoes in [true, false] {
+        let Pair {
+            mut prober,
+            mut follower,
+        } = pair(echoes);
+        prober.handle_timeout(at(0));
+        let t1 = sent(&mut prober, 10);
+        assert_eq!(t1.begins, Some(FederateId::new(0)));
+        prober.left(FederateId::new(0), at(40));
+        let heard = follower.receive(address(9), &t1.bytes, at(500));
+        let Heard::Answer { datagram, .. } = heard else {
+            panic!("{heard:?}");
+        };
+        follower.answered(at(600));
+        follower.left(at(650));
+        prober.receive(address(7), &datagram.encode(), at(1_000));
+        let (t4, probe) = (sent(&mut prober, 1_400), sent(&mut prober, 1_450));
+        follower.receive(address(9), &t4.bytes, at(2_000));
+        let heard = follower.receive(address(9), &probe.bytes, at(2_050));
+        // To LF's federates T3 came as much later as T1 left later.
+        let (t1, t4) = if echoes { (40, 1_000) } else { (10, 1_030) };
+        let [t1, t2, t3, t4] = [t1, 500, 650, t4].map(at);
+        let exchange = Exchange { t1, t2, t3, t4 };
+        assert_eq!(heard, Heard::Complete(exchange, true), "echoes: {echoes}");
+    }
 }

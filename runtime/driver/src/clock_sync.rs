@@ -128,6 +128,7 @@ impl ClockSync {
             servo,
             clock: Arc::clone(&self.clock),
             external: self.external.as_ref().map(External::shared),
+            answer: None,
         })?);
         Ok(())
     }

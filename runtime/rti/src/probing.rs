@@ -4,8 +4,9 @@ use std::io;
 use std::net::IpAddr;
 use std::os::fd::{AsFd, AsRawFd};
 
-use ictus_clock::{HostClock, ProbeSocket, Stamps};
+use ictus_clock::{HostClock, ProbeSocket, Sent, Stamps};
 use ictus_coord::rti::Rti;
+use ictus_coord::topology::FederateId;
 use mio::unix::SourceFd;
 use mio::{Interest, Poll, Token};
 
@@ -18,6 +19,8 @@ pub(crate) struct Probing {
     socket: ProbeSocket,
     /// More may be read without waiting for an event.
     pub(crate) readable: bool,
+    /// T1s of which the kernel has not said when they left, one a federate at most.
+    leaving: Vec<(Sent, FederateId)>,
 }
 
 impl Probing {
@@ -35,6 +38,7 @@ impl Probing {
         Ok(Self {
             socket,
             readable: true,
+            leaving: Vec::new(),
         })
     }
 
@@ -44,6 +48,7 @@ impl Probing {
     ///
     /// When the socket fails: clocks are compared no more.
     pub(crate) fn round(&mut self, rti: &mut Rti, clock: &HostClock) -> io::Result<()> {
+        self.hear_departures(rti, clock);
         let mut taken = 0;
         while self.readable && taken < ROUND {
             match self.socket.receive()? {
@@ -59,9 +64,25 @@ impl Probing {
         Ok(())
     }
 
-    fn transmit(&self, rti: &mut Rti, clock: &HostClock) {
+    fn transmit(&mut self, rti: &mut Rti, clock: &HostClock) {
         while let Some(transmit) = rti.poll_probe(clock.now()) {
-            self.socket.send(transmit.to, &transmit.bytes);
+            let sent = self.socket.send(transmit.to, &transmit.bytes);
+            if let (Some(sent), Some(federate)) = (sent, transmit.begins) {
+                self.leaving.retain(|(_, other)| *other != federate);
+                self.leaving.push((sent, federate));
+            }
+        }
+        self.hear_departures(rti, clock);
+    }
+
+    /// What the kernel says of when T1s left.
+    fn hear_departures(&mut self, rti: &mut Rti, clock: &HostClock) {
+        while let Some(departure) = self.socket.departed(clock) {
+            let this = |(sent, _): &(Sent, FederateId)| *sent == departure.sent;
+            if let Some(index) = self.leaving.iter().position(this) {
+                let (_, federate) = self.leaving.swap_remove(index);
+                rti.probe_left(federate, departure.when);
+            }
         }
     }
 }

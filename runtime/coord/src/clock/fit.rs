@@ -11,7 +11,7 @@ const WINDOW: usize = 256;
 /// Older ones say nothing of the present drift.
 const OLDEST: Duration = Duration::from_secs(60);
 /// Fewer say nothing of it either: noise tilts the line.
-const FEWEST: usize = 32;
+const FEWEST: usize = 64;
 /// The search for the drift ends at a tenth of a part per 10^9.
 const SEARCH_STEPS: usize = 40;
 
@@ -37,6 +37,10 @@ impl Window {
             self.exchanges.pop_front();
         }
         self.exchanges.push_back(exchange);
+    }
+
+    pub(super) fn is_full(&self) -> bool {
+        self.exchanges.len() >= WINDOW
     }
 
     pub(super) fn clear(&mut self) {

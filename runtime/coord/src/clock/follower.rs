@@ -114,7 +114,7 @@ impl Follower {
                 Heard::Nothing
             }
             Some(Datagram::T1(t1)) => self.begin(from, t1, arrived),
-            Some(Datagram::T4(t4)) => self.take_t4(t4, arrived),
+            Some(Datagram::T4 { came, left }) => self.take_t4(came, left, arrived),
             Some(Datagram::CodedProbe(t5)) => self.take_probe(t5, arrived),
         }
     }
@@ -124,6 +124,15 @@ impl Follower {
         if let State::Answering { t1, t2 } = self.state {
             let probe = None;
             self.state = State::AwaitingT4 { t1, t2, t3, probe };
+        }
+    }
+
+    /// T3 left when the base clock showed `when` or later, as the kernel says afterwards.
+    pub fn left(&mut self, when: PhysicalTime) {
+        match &mut self.state {
+            State::AwaitingT4 { t3, .. } => *t3 = when.max(*t3),
+            State::AwaitingProbe { exchange, .. } => exchange.t3 = when.max(exchange.t3),
+            State::Idle | State::Answering { .. } => {}
         }
     }
 
@@ -146,7 +155,7 @@ impl Follower {
         }
     }
 
-    fn take_t4(&mut self, t4: PhysicalTime, r4: PhysicalTime) -> Heard {
+    fn take_t4(&mut self, t4: PhysicalTime, left: Option<PhysicalTime>, r4: PhysicalTime) -> Heard {
         let State::AwaitingT4 { t1, t2, t3, probe } = self.state else {
             return Heard::Nothing;
         };
@@ -154,6 +163,8 @@ impl Follower {
         if t4 < t1 {
             return Heard::Nothing;
         }
+        // When T1 left, not when it was written, if the RTI has learnt that since.
+        let t1 = left.map_or(t1, |left| left.max(t1));
         let exchange = Exchange { t1, t2, t3, t4 };
         if !exchange.is_plausible() {
             self.give_up();

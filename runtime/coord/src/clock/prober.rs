@@ -5,7 +5,7 @@ use std::net::SocketAddr;
 
 use ictus_core::{Duration, PhysicalTime};
 
-use super::{Datagram, FromFederate};
+use super::{Datagram, Encoded, FromFederate};
 use crate::topology::FederateId;
 
 /// LF's patience for T3.
@@ -19,7 +19,9 @@ pub struct Transmit {
     /// Where to.
     pub to: SocketAddr,
     /// What.
-    pub bytes: [u8; 9],
+    pub bytes: Encoded,
+    /// The federate whose T1 this is: [`Prober::left`] wants to know when it leaves.
+    pub begins: Option<FederateId>,
 }
 
 /// Probes federates, each in its own rhythm: one that is silent keeps nobody waiting.
@@ -52,16 +54,20 @@ enum State {
     },
     /// T1 is about to be sent.
     Beginning,
-    /// T1 was sent at `t1`.
-    Waiting { t1: PhysicalTime },
+    /// T1 says `t1`; it left then or later.
+    Waiting {
+        t1: PhysicalTime,
+        left: Option<PhysicalTime>,
+    },
 }
 
 #[derive(Clone, Copy, Debug)]
 enum Outgoing {
     T1,
     T4 {
-        t4: PhysicalTime,
-        began: PhysicalTime,
+        came: PhysicalTime,
+        t1: PhysicalTime,
+        left: Option<PhysicalTime>,
     },
     CodedProbe {
         t4: PhysicalTime,
@@ -120,7 +126,7 @@ impl Prober {
     pub fn poll_timeout(&self) -> Option<PhysicalTime> {
         let due = |target: &Target| match target.state {
             State::Resting { until, .. } => Some(until),
-            State::Waiting { t1 } => Some(t1 + self.patience(target)),
+            State::Waiting { t1, .. } => Some(t1 + self.patience(target)),
             State::Beginning => None,
         };
         self.targets.iter().flatten().filter_map(due).min()
@@ -134,7 +140,7 @@ impl Prober {
             };
             let begins = match target.state {
                 State::Resting { since, until } => until <= now || since > now,
-                State::Waiting { t1 } => {
+                State::Waiting { t1, .. } => {
                     let over = t1 + self.patience(&target) <= now || t1 > now;
                     self.unanswered += u64::from(over);
                     over
@@ -153,11 +159,14 @@ impl Prober {
 
     /// Takes a datagram that came at `arrived` or before.
     pub fn receive(&mut self, from: SocketAddr, bytes: &[u8], arrived: PhysicalTime) {
-        let Some((federate, t1, echoes)) = self.answered(from, bytes) else {
+        let Some((federate, echoes)) = self.answered(from, bytes) else {
             self.strangers += 1;
             return;
         };
         let Some(Some(target)) = self.targets.get_mut(federate.index()) else {
+            return;
+        };
+        let State::Waiting { t1, left } = target.state else {
             return;
         };
         target.echoes = echoes;
@@ -167,32 +176,57 @@ impl Prober {
             until: t1 + self.period,
         };
         let t4 = Outgoing::T4 {
-            t4: arrived,
-            began: t1,
+            came: arrived,
+            t1,
+            left,
         };
         self.outgoing.push_back((federate, t4));
     }
 
+    /// T1 left when the clock showed `left` or later, as the kernel says afterwards.
+    pub fn left(&mut self, federate: FederateId, when: PhysicalTime) {
+        let target = self.targets.get_mut(federate.index());
+        if let Some(Some(target)) = target
+            && let State::Waiting { t1, left } = &mut target.state
+            && when >= *t1
+        {
+            *left = Some(when);
+        }
+    }
+
     /// The next datagram to send, made when the clock shows `now`.
     ///
-    /// T4 says when T3 came, and the probe as much later as it leaves after T4: LF's federates compare the two.
+    /// T4 says when T3 came, to who repeats T1 also when that left; to others, who think that T1 left at once, that T3 came as much
+    /// later: then both ways look alike. And the probe as much later as it leaves after T4: LF's federates compare the two.
     pub fn poll_transmit(&mut self, now: PhysicalTime) -> Option<Transmit> {
         loop {
             let (federate, outgoing) = self.outgoing.pop_front()?;
             let Some(Some(target)) = self.targets.get_mut(federate.index()) else {
                 continue;
             };
+            let mut begins = None;
             let datagram = match outgoing {
                 Outgoing::T1 => {
-                    target.state = State::Waiting { t1: now };
-                    Datagram::T1(now)
+                    let (t1, left) = (now, None);
+                    target.state = State::Waiting { t1, left };
+                    begins = Some(federate);
+                    Datagram::T1(t1)
                 }
-                Outgoing::T4 { t4, began } => {
+                Outgoing::T4 { came, t1, left } => {
                     // Never before T1, whatever the clock did.
-                    let t4 = t4.max(began);
-                    let probe = Outgoing::CodedProbe { t4, sent: now };
+                    let came = came.max(t1);
+                    let waited = left.map_or(Duration::ZERO, |left| left.since(t1));
+                    let (came, left) = if target.echoes {
+                        (came, left)
+                    } else {
+                        (came + waited, None)
+                    };
+                    let probe = Outgoing::CodedProbe {
+                        t4: came,
+                        sent: now,
+                    };
                     self.outgoing.push_front((federate, probe));
-                    Datagram::T4(t4)
+                    Datagram::T4 { came, left }
                 }
                 Outgoing::CodedProbe { t4, sent } => {
                     Datagram::CodedProbe(t4.saturating_add(now.since(sent)))
@@ -201,6 +235,7 @@ impl Prober {
             return Some(Transmit {
                 to: target.address,
                 bytes: datagram.encode(),
+                begins,
             });
         }
     }
@@ -214,14 +249,14 @@ impl Prober {
     }
 
     /// Whose answer to which T1 these bytes are.
-    fn answered(&self, from: SocketAddr, bytes: &[u8]) -> Option<(FederateId, PhysicalTime, bool)> {
+    fn answered(&self, from: SocketAddr, bytes: &[u8]) -> Option<(FederateId, bool)> {
         let answer = FromFederate::decode(bytes)?;
         let federate = FederateId::new(answer.federate);
         let target = self.targets.get(federate.index())?.as_ref()?;
-        let State::Waiting { t1 } = target.state else {
+        let State::Waiting { t1, .. } = target.state else {
             return None;
         };
         let fits = target.address == from && answer.echo.is_none_or(|echo| echo == t1);
-        fits.then_some((federate, t1, answer.echo.is_some()))
+        fits.then_some((federate, answer.echo.is_some()))
     }
 }

@@ -8,7 +8,7 @@ use crate::mutants::{Mutant, Mutants};
 use crate::plan::ClockPlan;
 use crate::report::{ClockSource, ClockStatus};
 
-/// How much of what a new fit says of the drift is believed.
+/// How much of what a new fit says of the drift is believed, once there is a long window.
 const DRIFT_GAIN: f64 = 0.1;
 /// Slewing is not made any steeper for a shorter period than this.
 const SHORTEST_SLEW: Duration = Duration::from_millis(50);
@@ -250,8 +250,11 @@ impl Servo {
             Drift::Unknown => {}
             Drift::Bent => self.window.halve(),
             Drift::Is(fitted) => {
-                let drift = self.drift_ppb.unwrap_or(fitted);
-                self.drift_ppb = Some(drift + (fitted - drift) * DRIFT_GAIN);
+                // While the window grows each fit knows much more than those before it.
+                let known = self.drift_ppb.filter(|_| self.window.is_full());
+                let most = as_float(DRIFT_BOUND_PPB);
+                let drift = known.map_or(fitted, |drift| drift + (fitted - drift) * DRIFT_GAIN);
+                self.drift_ppb = Some(drift.clamp(-most, most));
             }
         }
     }

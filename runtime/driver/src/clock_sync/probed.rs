@@ -4,7 +4,7 @@ use super::external::Shared;
 use super::lock;
 use crate::clock::SystemClock;
 use crate::transport;
-use ictus_clock::{Arrival, ProbeSocket};
+use ictus_clock::{Arrival, ProbeSocket, Sent};
 use ictus_coord::clock::{Correction, Follower, Heard, Interval, Servo, Taken};
 use ictus_coord::report::ClockStatus;
 use ictus_core::{Duration, PhysicalTime};
@@ -22,6 +22,8 @@ pub(super) struct Task {
     pub(super) servo: Servo,
     pub(super) clock: Arc<SystemClock>,
     pub(super) external: Option<Shared>,
+    /// The last T3.
+    pub(super) answer: Option<Sent>,
 }
 
 /// A running thread.
@@ -103,6 +105,7 @@ impl Task {
             if !fds[1].revents().is_empty() {
                 return;
             }
+            self.hear_departures();
             loop {
                 match self.socket.receive() {
                     Ok(Some(arrival)) => self.take(&arrival, known),
@@ -121,10 +124,11 @@ impl Task {
         match heard {
             Heard::Nothing => {}
             Heard::Answer { to, datagram } => {
-                let (bytes, length) = datagram.encode();
+                let bytes = datagram.encode();
                 let t3 = self.clock.base();
-                self.socket.send(to, &bytes[..length]);
+                self.answer = self.socket.send(to, &bytes);
                 self.follower.answered(t3);
+                self.hear_departures();
             }
             Heard::Complete(exchange, survived) => {
                 self.servo.trust(self.external_offset());
@@ -139,6 +143,15 @@ impl Task {
         let mut known = lock(known);
         let step = step.or(known.step);
         *known = self.known(step);
+    }
+
+    /// What the kernel says of when T3 left.
+    fn hear_departures(&mut self) {
+        while let Some(departure) = self.socket.departed(self.clock.host()) {
+            if Some(departure.sent) == self.answer {
+                self.follower.left(departure.when);
+            }
+        }
     }
 
     /// What the host's time service says must be added to the base clock, and how far that may be off.
