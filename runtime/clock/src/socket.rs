@@ -144,11 +144,12 @@ impl ProbeSocket {
             let (now, read_at) = (clock.now(), system());
             let (mut left, mut sent) = (None, None);
             for part in message.cmsgs().ok()? {
-                match part {
-                    ControlMessageOwned::ScmTimestampsns(stamps) => left = Some(stamps.system),
-                    ControlMessageOwned::Ipv4RecvErr(error, _)
-                    | ControlMessageOwned::Ipv6RecvErr(error, _) => sent = Some(error.ee_data),
-                    _ => {}
+                if let ControlMessageOwned::ScmTimestampsns(stamps) = part {
+                    left = Some(stamps.system);
+                } else if let ControlMessageOwned::Ipv4RecvErr(error, _)
+                | ControlMessageOwned::Ipv6RecvErr(error, _) = part
+                {
+                    sent = Some(error.ee_data);
                 }
             }
             if let (Some(left), Some(sent)) = (left, sent) {
@@ -169,12 +170,14 @@ impl ProbeSocket {
             match self.receive_one() {
                 Ok(Some(arrival)) => return Ok(Some(arrival)),
                 Ok(None) => {}
-                Err(error) => match error.kind() {
-                    io::ErrorKind::WouldBlock => return Ok(None),
-                    // A peer that is gone refuses, by ICMP, what was sent before.
-                    io::ErrorKind::Interrupted | io::ErrorKind::ConnectionRefused => {}
-                    _ => return Err(error),
-                },
+                Err(error) if error.kind() == io::ErrorKind::WouldBlock => return Ok(None),
+                // A peer that is gone refuses, by ICMP, what was sent before.
+                Err(error)
+                    if matches!(
+                        error.kind(),
+                        io::ErrorKind::Interrupted | io::ErrorKind::ConnectionRefused
+                    ) => {}
+                Err(error) => return Err(error),
             }
         }
     }
@@ -194,9 +197,12 @@ impl ProbeSocket {
         let length = message.bytes;
         let from = message.address.as_ref().and_then(address);
         let stamp = message.cmsgs().ok().and_then(|mut messages| {
-            messages.find_map(|message| match message {
-                ControlMessageOwned::ScmTimestampsns(stamps) => Some(stamps.system),
-                _ => None,
+            messages.find_map(|message| {
+                if let ControlMessageOwned::ScmTimestampsns(stamps) = message {
+                    Some(stamps.system)
+                } else {
+                    None
+                }
             })
         });
         let waited = stamp.map_or(Duration::ZERO, |stamp| since(read_at, stamp));

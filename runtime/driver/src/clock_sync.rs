@@ -203,3 +203,132 @@ fn stamps() -> Stamps {
 fn lock<T>(shared: &Mutex<T>) -> std::sync::MutexGuard<'_, T> {
     shared.lock().unwrap_or_else(PoisonError::into_inner)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::clock::Clock;
+    use ictus_clock::{HostClock, Skew};
+    use ictus_coord::clock::{Exchange, Prober};
+    use ictus_coord::report::ClockSource;
+    use ictus_coord::topology::FederateId;
+    use ictus_core::PhysicalTime;
+    use std::net::Ipv4Addr;
+
+    fn plan(sync: Mode) -> ClockPlan {
+        ClockPlan {
+            sync,
+            period_ns: 1_000_000,
+            ..ClockPlan::default()
+        }
+    }
+
+    fn skewed() -> Arc<SystemClock> {
+        Arc::new(SystemClock::of(HostClock::raw().with_skew(Skew {
+            offset_ns: 50_000_000,
+            drift_ppb: 50_000,
+        })))
+    }
+
+    fn joining(reference: &HostClock, clock: &SystemClock) -> Interval {
+        let t1 = reference.now();
+        let (t2, t3) = (clock.base(), clock.base());
+        let t4 = reference.now();
+        Interval::of(&Exchange { t1, t2, t3, t4 }).unwrap()
+    }
+
+    /// How far a clock is from the reference, and how long it took to find out.
+    fn apart(reference: &HostClock, clock: &SystemClock) -> (Duration, Duration) {
+        let before = reference.now();
+        let shown = clock.now();
+        let after = reference.now();
+        (shown.since(before), after.since(before))
+    }
+
+    #[test]
+    fn a_wrong_clock_follows_the_probes() {
+        let reference = HostClock::steady();
+        let local = Ipv4Addr::LOCALHOST.into();
+        let mut socket = ProbeSocket::bind(local, 0, Stamps::Kernel).unwrap();
+        let rti = SocketAddr::new(local, socket.port().unwrap());
+        let clock = skewed();
+        let mut sync =
+            ClockSync::start(&plan(Mode::On), 3, clock.clone(), Some(rti), true).unwrap();
+        sync.begin(joining(&reference, &clock)).unwrap();
+        let federate = SocketAddr::new(local, sync.udp_port());
+        let mut stranger = ProbeSocket::bind(local, 0, Stamps::Reader).unwrap();
+        stranger.send(federate, &[21; 9]);
+        socket.send(federate, &[1, 2, 3]);
+
+        let mut prober = Prober::new(4, Duration::from_millis(1));
+        prober.begin(PhysicalTime::from_nanos(0), FederateId::new(3), federate);
+        while sync.status().probes_kept + sync.status().probes_dropped < 200 {
+            prober.handle_timeout(reference.now());
+            while let Some(arrival) = socket.receive().unwrap() {
+                prober.receive(arrival.from, arrival.bytes(), arrival.came(&reference));
+            }
+            while let Some(transmit) = prober.poll_transmit(reference.now()) {
+                socket.send(transmit.to, &transmit.bytes);
+            }
+            let status = sync.status();
+            let (apart, took) = apart(&reference, &clock);
+            let bound = Duration::from_nanos(status.bound_ns.unwrap());
+            let far = apart.as_nanos().abs() - took.as_nanos();
+            assert!(far <= bound.as_nanos(), "{far} ns off, {status:?}");
+        }
+        let status = sync.status();
+        assert_eq!(status.source, ClockSource::Builtin);
+        assert_eq!((status.strangers, status.steps), (2, 0));
+        assert!((-51_000_000..-49_000_000).contains(&status.offset_ns));
+    }
+
+    #[test]
+    fn exchanges_while_joining_are_enough_for_init() {
+        let reference = HostClock::steady();
+        let clock = skewed();
+        let rti = Some(([127, 0, 0, 1], 1).into());
+        let mut sync = ClockSync::start(&plan(Mode::Init), 0, clock.clone(), rti, true).unwrap();
+        assert_eq!(sync.udp_port(), 0);
+        assert_eq!(sync.status().bound_ns, None);
+        sync.begin(joining(&reference, &clock)).unwrap();
+        let status = sync.status();
+        assert!(
+            status.synchronized && status.bound_ns.is_some(),
+            "{status:?}"
+        );
+    }
+
+    #[test]
+    fn a_clock_that_is_not_known_well_enough_is_refused() {
+        let clock = Arc::new(SystemClock::new());
+        let strict = |sync, max_error_ns, on_exceed| ClockPlan {
+            max_error_ns: Some(max_error_ns),
+            on_exceed,
+            ..plan(sync)
+        };
+        let start =
+            |plan: &ClockPlan| ClockSync::start(plan, 0, clock.clone(), None, true).unwrap();
+        let most = Duration::from_nanos(1);
+        let mut off = start(&strict(Mode::Off, 1, OnExceed::Warn));
+        assert_eq!(off.check(), Err(ClockRefusal::Unknown { most }));
+        assert!(!off.refuses());
+        let mut init = start(&strict(Mode::Init, 1, OnExceed::Refuse));
+        init.begin(joining(&HostClock::steady(), &clock)).unwrap();
+        let refusal = init.check().unwrap_err();
+        assert!(
+            matches!(refusal, ClockRefusal::TooUncertain { .. }),
+            "{refusal}"
+        );
+        assert!(init.refuses());
+        let mut lenient = start(&strict(Mode::Init, 1_000_000_000, OnExceed::Refuse));
+        lenient
+            .begin(joining(&HostClock::steady(), &clock))
+            .unwrap();
+        assert_eq!(lenient.check(), Ok(()));
+        assert_eq!(
+            start(&plan(Mode::Off)).check(),
+            Ok(()),
+            "nothing is asked for"
+        );
+    }
+}

@@ -199,7 +199,7 @@ impl Parser {
             "-a" | "--auth" => self.options.config.authentication = true,
             "--continue" => self.continue_without(option)?,
             "--clock-port" => {
-                self.options.clock_port = self.number(option, "a port (0 to 65535)")?
+                self.options.clock_port = self.number(option, "a port (0 to 65535)")?;
             }
             "--clock-stamps" => self.options.stamps = self.stamps(option)?,
             "-d" | "--dnet_disabled" => self.options.config.dnet = false,

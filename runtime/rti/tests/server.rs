@@ -522,3 +522,112 @@ fn status_lines_tell_the_story() {
         ["listening", "joined", "start", "resigned", "ended"]
     );
 }
+
+/// A federate as LF writes them: three exchanges over TCP, then T3 of three bytes to whatever T1 comes.
+struct Probed {
+    peer: Peer,
+    socket: UdpSocket,
+}
+
+fn join_probed(rti: &Running) -> Probed {
+    let mut peer = rti.connect();
+    let socket = UdpSocket::bind((Ipv4Addr::LOCALHOST, 0)).unwrap();
+    socket.set_read_timeout(Some(PATIENCE)).unwrap();
+    let federation = b"test";
+    let structure = NeighborStructure {
+        upstream: Vec::new(),
+        downstream: Vec::new(),
+    };
+    peer.send(&[
+        ToRti::FederateIds {
+            federate: 0,
+            federation,
+        },
+        ToRti::NeighborStructure(structure),
+        ToRti::UdpPort(socket.local_addr().unwrap().port()),
+    ]);
+    assert_eq!(peer.next().unwrap(), "Ack");
+    for _ in 0..3 {
+        peer.wait_for("ClockSyncT1");
+        peer.send(&[ToRti::ClockSyncT3 { federate: 0 }]);
+        peer.wait_for("ClockSyncT4");
+    }
+    peer.send(&[ToRti::Timestamp(PhysicalTime::from_nanos(1_000_000_000))]);
+    Probed { peer, socket }
+}
+
+fn probing() -> Options {
+    let mut options = Options::new("test", 1);
+    options.config.clock_exchanges = 3;
+    options.config.clock_period = Some(ictus_core::Duration::from_millis(1));
+    options
+}
+
+/// The next datagram: its type, its reading, who sent it.
+fn probe(socket: &UdpSocket) -> (u8, i64, SocketAddr) {
+    let mut bytes = [0; 64];
+    let (length, from) = socket.recv_from(&mut bytes).unwrap();
+    assert_eq!(length, 9, "LF's datagrams have nine bytes");
+    (
+        bytes[0],
+        i64::from_le_bytes(bytes[1..9].try_into().unwrap()),
+        from,
+    )
+}
+
+#[test]
+fn clocks_are_compared_for_ever_as_lf_does() {
+    let rti = serve(probing());
+    let Probed { mut peer, socket } = join_probed(&rti);
+    peer.wait_for("Timestamp(");
+    for _ in 0..20 {
+        let (kind, t1, from) = probe(&socket);
+        assert_eq!(kind, 19);
+        socket.send_to(&[20, 0, 0], from).unwrap();
+        let (kind, t4, _) = probe(&socket);
+        assert!(kind == 21 && t4 >= t1);
+        let (kind, t5, _) = probe(&socket);
+        assert!(kind == 22 && t5 >= t4);
+    }
+    peer.resign();
+    assert_eq!(rti.ended(), 0);
+}
+
+#[test]
+fn a_stranger_answers_no_probe() {
+    let rti = serve(probing());
+    let Probed { mut peer, socket } = join_probed(&rti);
+    peer.wait_for("Timestamp(");
+    let (_, _, from) = probe(&socket);
+    let stranger = UdpSocket::bind((Ipv4Addr::LOCALHOST, 0)).unwrap();
+    for bytes in [&[20, 0, 0][..], &[20, 9, 0], &[19; 9], &[0; 60_000], &[]] {
+        stranger.send_to(bytes, from).unwrap();
+    }
+    for bytes in [
+        &[20, 1, 0][..],
+        &[20, 0],
+        &[7; 500],
+        &[20, 0, 0, 1, 1, 1, 1, 1, 1, 1, 1],
+    ] {
+        socket.send_to(bytes, from).unwrap();
+    }
+    socket.send_to(&[20, 0, 0], from).unwrap();
+    assert_eq!(probe(&socket).0, 21, "the answer is taken all the same");
+    peer.resign();
+    assert_eq!(rti.ended(), 0);
+}
+
+#[test]
+fn a_federate_that_answers_no_probe_keeps_nobody_waiting() {
+    let mut options = probing();
+    options.config.federates = 2;
+    let rti = serve(options);
+    let mut probed = join_probed(&rti);
+    let mut other = rti.join(1, &[], &[]);
+    other.start();
+    probed.peer.wait_for("Timestamp(");
+    assert_eq!(probe(&probed.socket).0, 19);
+    other.resign();
+    probed.peer.resign();
+    assert_eq!(rti.ended(), 0);
+}

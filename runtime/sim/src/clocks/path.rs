@@ -78,7 +78,7 @@ fn exponential(rng: &mut Rng, mean: i64) -> i64 {
             run += 1;
         }
         if run % 2 == 1 {
-            let fraction = i128::from(first) * i128::from(mean) >> 32;
+            let fraction = (i128::from(first) * i128::from(mean)) >> 32;
             return whole * mean + i64::try_from(fraction).unwrap_or(0);
         }
         whole += 1;
