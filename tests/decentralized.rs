@@ -66,7 +66,10 @@ fn what_comes_too_late_is_handled_and_counted_at_an_offset_of_zero() {
     // 51 ticks; what comes after the ear's last tag is counted but cannot be handled any more.
     assert!(tardy >= 40, "{heard} in time, {tardy} tardy");
     let counted = violations(&sandbox, "late", "ear");
-    assert!((tardy..=tardy + 1).contains(&counted), "{tardy} tardy, {counted} counted");
+    assert!(
+        (tardy..=tardy + 1).contains(&counted),
+        "{tardy} tardy, {counted} counted"
+    );
 }
 
 #[test]
@@ -89,7 +92,10 @@ fn one_stp_violation_too_many_stops_the_federation() {
     let view = sandbox.ended("strict");
     assert_eq!(view["outcome"]["failure"]["member"], "ear", "{view}");
     assert!(ending(&view, "ear").contains("14"), "{view}");
-    assert!(ending(&view, "beat").contains('0'), "stopped in order: {view}");
+    assert!(
+        ending(&view, "beat").contains('0'),
+        "stopped in order: {view}"
+    );
 }
 
 #[test]
@@ -122,9 +128,15 @@ fn a_federate_that_may_be_outlived_stops_nobody() {
         let view = sandbox.ended("outlived");
         assert_eq!(view["outcome"]["failure"]["member"], "beat", "{view}");
         // It goes on to the time-out, alone.
-        assert!(!ending(&view, "ear").contains("11"), "{coordination}: {view}");
+        assert!(
+            !ending(&view, "ear").contains("11"),
+            "{coordination}: {view}"
+        );
         let (heard, tardy) = heard(&sandbox, "outlived");
-        assert!(heard < 151 && tardy == 0, "{coordination}: {heard}, {tardy}");
+        assert!(
+            heard < 151 && tardy == 0,
+            "{coordination}: {heard}, {tardy}"
+        );
     }
 }
 
@@ -196,7 +208,10 @@ connections:
         // What comes at the very end may get a tag after the stop tag.
         let mut numbers = line.split([' ', ',']).filter_map(|w| w.parse::<u64>().ok());
         let (early, heard) = (numbers.next_back().unwrap(), numbers.next_back().unwrap());
-        assert!((45..=51).contains(&heard) && early == 0, "{coordination}: {line}");
+        assert!(
+            (45..=51).contains(&heard) && early == 0,
+            "{coordination}: {line}"
+        );
         assert_eq!(violations(&sandbox, "physical", "stamped"), 0);
     }
 }
@@ -208,7 +223,8 @@ fn the_programs_own_offsets_come_from_the_solver() {
 bounds: { launch_lag: 20 ms, latency: 400 ms, clock_error: 0 ms }\ndefaults: { stp_offset: auto }";
     let file = manifest(&sandbox, "solved", head, BEAT);
     let plan = sandbox.ok(&["plan", &file]);
-    let words = "ear 420.0 ms = beat offset 0 + beat launch lag 20.0 + network 400.0 + clock 0 - after 0";
+    let words =
+        "ear 420.0 ms = beat offset 0 + beat launch lag 20.0 + network 400.0 + clock 0 - after 0";
     assert!(plan.contains(words), "{plan}");
     sandbox.ok(&["up", &file]);
     sandbox.ended("solved");
@@ -217,5 +233,8 @@ bounds: { launch_lag: 20 ms, latency: 400 ms, clock_error: 0 ms }\ndefaults: { s
         assert!(report.contains(words), "{words} is missing in {report}");
     }
     let suggested = sandbox.ok(&["timing", "solved", "--suggest"]);
-    assert!(suggested.contains("bounds:") && suggested.contains("launch_lag"), "{suggested}");
+    assert!(
+        suggested.contains("bounds:") && suggested.contains("launch_lag"),
+        "{suggested}"
+    );
 }

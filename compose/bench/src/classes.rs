@@ -44,13 +44,15 @@ impl Meter {
     }
 }
 
-/// Sends `count` numbers, one a tag, tags one microsecond apart, as fast as it may.
+/// Sends `count` numbers, one a tag, tags `gap` apart, as fast as it may.
 #[reactor]
 pub(crate) struct Flood {
     #[param(default = 1)]
     count: u32,
+    #[param(default = 1.us())]
+    gap: Duration,
     out: Output<u32>,
-    #[action(min_delay = 1.us())]
+    #[action(min_delay = gap)]
     next: LogicalAction<()>,
     sent: u32,
 }

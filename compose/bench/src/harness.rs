@@ -32,6 +32,8 @@ pub(crate) struct Case {
     pub(crate) connections: Vec<(Port, Port, Option<i64>)>,
     /// Ahead of physical time.
     pub(crate) fast: bool,
+    /// Decentralized coordination, and every federate's STP offset.
+    pub(crate) stp_offset: Option<Duration>,
 }
 
 type Port = (u16, &'static str, u32);
@@ -68,9 +70,20 @@ impl Case {
             .federates
             .iter()
             .map(|(name, class, parameters)| {
-                json!({"name": name, "class": class, "program": "bench", "parameters": parameters})
+                let mut federate = json!({
+                    "name": name, "class": class, "program": "bench", "parameters": parameters
+                });
+                if let Some(offset) = self.stp_offset {
+                    let nanos = u64::try_from(offset.as_nanos()).unwrap_or(u64::MAX);
+                    federate["stp_offset_ns"] = json!(nanos);
+                }
+                federate
             })
             .collect();
+        let coordination = match self.stp_offset {
+            Some(_) => "decentralized",
+            None => "centralized",
+        };
         let mut next_port = vec![0_u16; federates.len()];
         let end = |(federate, port, channel): Port| json!({"federate": federate, "port": port, "channel": channel});
         let connections: Vec<Value> = self
@@ -90,7 +103,7 @@ impl Case {
             })
             .collect();
         json!({
-            "ictus": "v1", "federation": self.name, "coordination": "centralized",
+            "ictus": "v1", "federation": self.name, "coordination": coordination,
             "fast": self.fast, "max_lead_ns": 20_000_000, "extensions": true,
             "federates": federates, "connections": connections
         })

@@ -91,7 +91,7 @@ impl Settings {
             "{:<26} {:>12} {:>26} {:>14}",
             "", "ictus", "floor", "peak MiB"
         )?;
-        for case in [source_sink, pipeline, two_sources] {
+        for case in [source_sink, decentralized, pipeline, two_sources] {
             self.throughput(bench, &mut out, case)?;
         }
         if self.wants("rti") {
@@ -116,7 +116,8 @@ impl Settings {
             )?;
         }
         if self.wants("latency") {
-            self.latency(bench, &mut out)?;
+            self.latency(bench, &mut out, None)?;
+            self.latency(bench, &mut out, Some(Duration::ZERO))?;
         }
         self.in_process(bench, &mut out)
     }
@@ -156,7 +157,12 @@ impl Settings {
         )
     }
 
-    fn latency(&self, bench: &Bench, out: &mut impl Write) -> io::Result<()> {
+    fn latency(
+        &self,
+        bench: &Bench,
+        out: &mut impl Write,
+        stp_offset: Option<Duration>,
+    ) -> io::Result<()> {
         let count = self.count(2000);
         let case = Case {
             name: "latency",
@@ -166,6 +172,7 @@ impl Settings {
             ],
             connections: vec![((0, "out", 0), (1, "input", 0), None)],
             fast: false,
+            stp_offset,
         };
         let results = bench.federated(&case)?;
         let micros = |key| results.number(key).unwrap_or(f64::NAN) / 1000.0;
@@ -176,7 +183,10 @@ impl Settings {
         )?;
         row(
             out,
-            "1 kHz one way p50/p99, us",
+            match stp_offset {
+                Some(_) => "1 kHz decentralized, us",
+                None => "1 kHz one way p50/p99, us",
+            },
             &ours,
             &format!("tcp relay {}", quantiles(&floor)),
             "",
@@ -196,12 +206,14 @@ impl Settings {
                 ((1, "out", 0), (0, "input", 0), None),
             ],
             fast: true,
+            stp_offset: None,
         };
         let mut fan_out = Case {
             name: "fan-out",
             federates: vec![("fan", "Fan", json!({"count": self.count(2_000_000)}))],
             connections: Vec::new(),
             fast: true,
+            stp_offset: None,
         };
         const SINKS: [&str; 10] = ["s0", "s1", "s2", "s3", "s4", "s5", "s6", "s7", "s8", "s9"];
         for (index, sink) in (1..).zip(SINKS) {
@@ -253,6 +265,26 @@ fn source_sink(messages: u64) -> Case {
         ],
         connections: vec![((0, "out", 0), (1, "input", 0), None)],
         fast: true,
+        stp_offset: None,
+    }
+}
+
+/// From federate to federate, tags 100 ns apart and never ahead of physical time: the sink needs no offset, because a
+/// message says that none before it is missing.
+fn decentralized(messages: u64) -> Case {
+    Case {
+        name: "S1 decentralized",
+        federates: vec![
+            (
+                "source",
+                "Flood",
+                json!({"count": messages, "gap": "100 ns"}),
+            ),
+            ("sink", "Sink", json!({"count": messages})),
+        ],
+        fast: false,
+        stp_offset: Some(Duration::ZERO),
+        ..source_sink(messages)
     }
 }
 
@@ -269,6 +301,7 @@ fn pipeline(messages: u64) -> Case {
             ((1, "out", 0), (2, "input", 0), None),
         ],
         fast: true,
+        stp_offset: None,
     }
 }
 
@@ -285,6 +318,7 @@ fn two_sources(messages: u64) -> Case {
             ((1, "out", 0), (2, "second", 0), None),
         ],
         fast: true,
+        stp_offset: None,
     }
 }
 

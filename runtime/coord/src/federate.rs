@@ -30,8 +30,8 @@ use crate::mutants::Mutant;
 use crate::payload::{FederateExecutor, PayloadError};
 use crate::wire::{DecodeError, RejectReason};
 use ictus_core::{
-    ActionId, Admission, Delay, Duration, Effects, NodeId, NodeKind, OutputId,
-    PhysicalTime, Program, Progress, Tag, Timeline, ValueId,
+    ActionId, Admission, Delay, Duration, Effects, NodeId, NodeKind, OutputId, PhysicalTime,
+    Program, Progress, Tag, Timeline, ValueId,
 };
 use join::Phase;
 pub use link::{InputLink, LinkConfig, OutputLink};

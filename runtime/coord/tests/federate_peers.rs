@@ -253,7 +253,11 @@ fn a_message_after_its_time_is_tardy_and_counted_with_its_lateness() {
     assert_eq!(world.federate.counters().stp_violations, 1);
     let (_, upstream) = world.federate.measures().upstreams().next().unwrap();
     assert_eq!(upstream.lateness.max(), Duration::from_millis(1));
-    assert_eq!(upstream.arrival.max(), Duration::from_millis(6), "it was on its way all the same");
+    assert_eq!(
+        upstream.arrival.max(),
+        Duration::from_millis(6),
+        "it was on its way all the same"
+    );
     world.says(sender, &message(0, 0, 8));
     let (_, upstream) = world.federate.measures().upstreams().next().unwrap();
     assert_eq!(upstream.slack.max(), Duration::from_millis(7));
