@@ -217,6 +217,23 @@ connections:
 }
 
 #[test]
+fn lf_0_13_layouts_authentication_and_continuous_clocks_go_together() {
+    let sandbox = Sandbox::new();
+    let head = "coordination: decentralized\ntimeout: 1 s\nwire: \"0.13\"\nauthentication: true
+clock: { sync: on, max_error: 100 ms }\ndefaults: { stp_offset: 1 s }";
+    let file = manifest(&sandbox, "proven", head, BEAT);
+    sandbox.ok(&["up", &file]);
+    let view = sandbox.ended("proven");
+    assert_eq!(view["outcome"]["outcome"], "completed", "{view}");
+    assert_eq!(heard(&sandbox, "proven"), (51, 0));
+    let metrics = sandbox.ok(&["metrics"]);
+    assert!(
+        metrics.contains("ictus_clock_error_bound_seconds{"),
+        "{metrics}"
+    );
+}
+
+#[test]
 fn the_programs_own_offsets_come_from_the_solver() {
     let sandbox = Sandbox::new();
     let head = "coordination: decentralized\ntimeout: 1 s

@@ -5,7 +5,7 @@ use ictus_coord::federate::{Federate, FederateConfig, FederateEvent, LinkConfig,
 use ictus_coord::federate::{PeerStream, Poll};
 use ictus_coord::plan::{Plan, Wire};
 use ictus_coord::wire::{
-    FromPeer, PeerMessage, PortAbsent, RejectReason, TaggedMessage, ToFederate, ToPeer,
+    FromPeer, PeerMessage, PortAbsent, RejectReason, TaggedMessage, ToFederate, ToPeer, ToRti,
 };
 use ictus_coord::{FederateExecutor, PayloadError};
 use ictus_core::{
@@ -64,6 +64,10 @@ struct World {
 
 impl World {
     fn new(plan: &Plan) -> Self {
+        Self::with(plan, None)
+    }
+
+    fn with(plan: &Plan, data_address: Option<[u8; 4]>) -> Self {
         let mut builder = ProgramBuilder::new();
         let me = builder.reactor("me");
         let a = builder.port(me, "a", PortKind::Input);
@@ -73,6 +77,7 @@ impl World {
         let program = Arc::new(builder.build().unwrap());
         let mut link = LinkConfig::from_plan(plan, 0, &[0, 1], &[]);
         link.federation = "test".to_owned();
+        link.data_address = data_address;
         let config = FederateConfig {
             keepalive: true,
             ..FederateConfig::default()
@@ -368,6 +373,25 @@ fn a_goodbye_and_a_sender_that_may_be_outlived_explain_themselves() {
         world.at(60_000);
         assert!(world.federate.outcome().is_none(), "{on_failure}");
         assert_eq!(world.federate.timeline().at(), tag(0));
+    }
+}
+
+#[test]
+fn a_data_address_of_its_own_is_told_to_our_rti_only() {
+    for (extensions, told) in [
+        (true, "DataAddress { port: 7, address: [10, 1, 2, 3] }"),
+        (false, "AddressAdvertisement { port: 7 }"),
+    ] {
+        let mut plan = plan("stop-federation", "");
+        plan.extensions = extensions;
+        let mut world = World::with(&plan, Some([10, 1, 2, 3]));
+        let bytes = std::mem::take(world.federate.output().unwrap());
+        let (mut said, mut rest) = (Vec::new(), &bytes[..]);
+        while let Some((message, length)) = ToRti::decode(rest).unwrap() {
+            said.push(format!("{message:?}"));
+            rest = &rest[length..];
+        }
+        assert!(said.iter().any(|message| message == told), "{said:?}");
     }
 }
 

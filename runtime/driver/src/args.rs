@@ -1,5 +1,6 @@
 //! The command line of a federate program.
 
+use std::net::Ipv4Addr;
 use std::path::PathBuf;
 use thiserror::Error;
 
@@ -24,6 +25,8 @@ pub(crate) struct RunArgs {
     pub(crate) trace: Option<PathBuf>,
     pub(crate) timing: Option<PathBuf>,
     pub(crate) status_fd: Option<u32>,
+    /// Where other federates reach this one, when it is not the address by which it reaches the RTI.
+    pub(crate) data_address: Option<Ipv4Addr>,
 }
 
 /// Why a command line is refused.
@@ -35,13 +38,15 @@ pub(crate) enum ArgsError {
     MissingValue(String),
     #[error("--status-fd needs a descriptor number, not {0:?}")]
     BadDescriptor(String),
+    #[error("--data-address needs an IPv4 address of this host, not {0:?}")]
+    BadAddress(String),
     #[error("nothing to do: give --plan FILE, or --describe")]
     Nothing,
 }
 
 pub(crate) const USAGE: &str = "\
 usage: PROGRAM --plan PLAN.json [--federate NAME]... [--rti HOST:PORT] [-i ID]
-               [--trace DIR] [--timing DIR] [--status-fd N]
+               [--data-address IPv4] [--trace DIR] [--timing DIR] [--status-fd N]
        PROGRAM --describe [INSTANCES.json]
 
 Without --rti the whole plan runs in this process. With --rti each named federate joins the RTI as itself.
@@ -72,6 +77,11 @@ pub(crate) fn parse(args: impl IntoIterator<Item = String>) -> Result<Command, A
             "--status-fd" => {
                 let text = value()?;
                 run.status_fd = Some(text.parse().map_err(|_| ArgsError::BadDescriptor(text))?);
+            }
+            "--data-address" => {
+                let text = value()?;
+                let address = text.parse().map_err(|_| ArgsError::BadAddress(text))?;
+                run.data_address = Some(address);
             }
             _ => return Err(ArgsError::Unknown(arg)),
         }
@@ -115,6 +125,10 @@ mod tests {
         let line =
             "--plan p.json --federate a --federate b --rti 127.0.0.1:15045 -i x --status-fd 3";
         assert_eq!(words(line), Ok(Command::Run(run)));
+        assert_eq!(
+            words("--plan p --data-address robot.local"),
+            Err(ArgsError::BadAddress("robot.local".into()))
+        );
         assert_eq!(
             words("--plan p --status-fd x"),
             Err(ArgsError::BadDescriptor("x".into()))

@@ -23,7 +23,7 @@ use ictus_coord::plan::Plan;
 use ictus_coord::report::{FederateStatus, exit};
 use ictus_core::{Duration, PhysicalTime, Tag};
 use std::io::{self, Write};
-use std::net::{SocketAddr, ToSocketAddrs};
+use std::net::{IpAddr, Ipv4Addr, SocketAddr, ToSocketAddrs};
 use std::process::ExitCode;
 use std::sync::Arc;
 
@@ -228,6 +228,7 @@ fn run_one(job: &Job<'_>, ids: &[u16], rti: Option<SocketAddr>) -> Result<u8, Ru
                 .unwrap_or_else(default_federation);
             link.authentication = job.plan.authentication.then(nonce).transpose()?;
             link.clock_port = sync.udp_port();
+            link.data_address = job.args.data_address.map(|address| address.octets());
             Federate::federated(program, config, link)
         }
         (Some(_) | None, _) => Federate::alone(program, config),
@@ -249,6 +250,7 @@ fn run_one(job: &Job<'_>, ids: &[u16], rti: Option<SocketAddr>) -> Result<u8, Ru
         status: Status::new(job.args.status_fd).map_err(RunError::Status)?,
         start: Tag::NEVER,
         outside: Vec::new(),
+        data_address: job.args.data_address,
         signals: 0,
         written_at: PhysicalTime::NEVER,
         reported_at: PhysicalTime::NEVER,
@@ -342,6 +344,7 @@ struct Runner<'a> {
     status: Status,
     start: Tag,
     outside: Vec<OutsideEvent>,
+    data_address: Option<Ipv4Addr>,
     signals: usize,
     written_at: PhysicalTime,
     reported_at: PhysicalTime,
@@ -394,13 +397,16 @@ impl Runner<'_> {
         self.leave()
     }
 
-    /// Listens for other federates at the address by which this host reaches the RTI.
+    /// Listens for other federates at the data address, or else where this host reaches the RTI.
     fn listen(&mut self) -> Result<(), RunError> {
         if let Some(connection) = &self.io.connection {
-            let here = connection.local().map_err(RunError::Io)?;
+            let here = match self.data_address {
+                Some(address) => IpAddr::V4(address),
+                None => connection.local().map_err(RunError::Io)?.ip(),
+            };
             let peers = &mut self.io.peers;
             peers
-                .listen(here.ip(), &mut self.federate)
+                .listen(here, &mut self.federate)
                 .map_err(RunError::Io)?;
         }
         Ok(())

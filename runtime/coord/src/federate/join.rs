@@ -243,7 +243,12 @@ impl Federate {
         let Some(link) = &mut self.link else { return };
         if let Some(port) = link.peers.port {
             let port = i32::from(port);
-            link.say(&ToRti::AddressAdvertisement { port });
+            // LF's RTI tells others the address that it sees itself.
+            let own = link.config.data_address.filter(|_| link.config.extensions);
+            link.say(&match own {
+                Some(address) => ToRti::DataAddress { port, address },
+                None => ToRti::AddressAdvertisement { port },
+            });
         }
         self.phase = Phase::Meeting;
     }

@@ -51,6 +51,8 @@ pub struct LinkConfig {
     pub fast: bool,
     /// Whether time and STP offsets decide, and messages go from federate to federate.
     pub decentralized: bool,
+    /// Where others reach this federate (IPv4), when it is not the address that the RTI sees.
+    pub data_address: Option<[u8; 4]>,
     /// The layout of the messages that differ between LF's releases.
     pub wire: Wire,
     /// This federate's STP offset S: its launch lag is measured from there.
@@ -118,6 +120,7 @@ impl LinkConfig {
             max_lead: plan.max_lead_ns.map(Duration::from_nanos),
             fast: plan.fast,
             decentralized,
+            data_address: None,
             wire: plan.wire,
             stp_offset: Duration::from_nanos(plan.federates[usize::from(id)].stp_offset_ns),
             max_stp_violations: plan.federates[usize::from(id)].max_stp_violations,
