@@ -359,18 +359,30 @@ fn strangers_are_counted_and_forgotten() {
         follower.receive(address(9), &t1.bytes, at(0)),
         Heard::Answer { .. }
     ));
+    assert_eq!(
+        follower.receive(address(9), &t1.bytes, at(9)),
+        Heard::Nothing,
+        "twice"
+    );
+    // The first who completes an exchange is the RTI, not the first who speaks.
+    follower.answered(at(10));
+    let t4 = Datagram::T4 {
+        came: at(20),
+        left: None,
+    };
+    follower.receive(address(9), &t4.encode(), at(30));
+    let probe = Datagram::CodedProbe(at(21)).encode();
+    follower.receive(address(10), &probe, at(31));
+    assert_eq!(follower.strangers(), 3);
+    let complete = follower.receive(address(9), &probe, at(31));
+    assert!(matches!(complete, Heard::Complete(..)));
     let later = Datagram::T1(at(5)).encode();
     assert_eq!(
         follower.receive(address(10), &later, at(9)),
         Heard::Nothing,
         "another port"
     );
-    assert_eq!(
-        follower.receive(address(9), &t1.bytes, at(9)),
-        Heard::Nothing,
-        "twice"
-    );
-    assert_eq!(follower.strangers(), 3);
+    assert_eq!(follower.strangers(), 4);
 }
 
 #[test]

@@ -34,8 +34,10 @@ pub struct Follower {
     federate: u16,
     echoes: bool,
     reference: IpAddr,
-    /// Where the first T1 came from: probes come from nowhere else.
+    /// Where the last T1 came from.
     port: Option<u16>,
+    /// An exchange with it was complete: probes come from nowhere else.
+    settled: bool,
     state: State,
     remembered: [PhysicalTime; REMEMBERED],
     next: usize,
@@ -75,6 +77,7 @@ impl Follower {
             echoes,
             reference,
             port: None,
+            settled: false,
             state: State::Idle,
             remembered: [PhysicalTime::NEVER; REMEMBERED],
             next: 0,
@@ -106,8 +109,11 @@ impl Follower {
 
     /// Takes what `from` sent; it came when the base clock showed `arrived` or before.
     pub fn receive(&mut self, from: SocketAddr, bytes: &[u8], arrived: PhysicalTime) -> Heard {
-        let known = self.port.is_none_or(|port| port == from.port());
-        let datagram = Datagram::decode(bytes).filter(|_| known && from.ip() == self.reference);
+        let known = |datagram: &Datagram| {
+            let begins = matches!(datagram, Datagram::T1(_)) && !self.settled;
+            from.ip() == self.reference && (begins || self.port == Some(from.port()))
+        };
+        let datagram = Datagram::decode(bytes).filter(known);
         match datagram {
             None => {
                 self.strangers += 1;
@@ -201,6 +207,7 @@ impl Follower {
         r5: PhysicalTime,
     ) -> Heard {
         self.state = State::Idle;
+        self.settled = true;
         let sent = t5.since(exchange.t4).as_nanos();
         let came = r5.since(r4).as_nanos();
         let survived = came.abs_diff(sent) < SPACING_GUARD.as_nanos().unsigned_abs();
