@@ -34,7 +34,8 @@ connections:
 fn heard(sandbox: &Sandbox, federation: &str) -> (u64, u64) {
     let logs = sandbox.ok(&["logs", federation]);
     let line = logs.lines().find(|line| line.contains("in time and"));
-    let line = line.unwrap_or_else(|| panic!("{logs}"));
+    assert!(line.is_some(), "{logs}");
+    let line = line.unwrap();
     let mut numbers = line.split(' ').filter_map(|word| word.parse::<u64>().ok());
     let (tardy, heard) = (numbers.next_back().unwrap(), numbers.next_back().unwrap());
     (heard, tardy)

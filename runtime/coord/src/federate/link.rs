@@ -21,6 +21,10 @@ const PROMISE_SPACING: Duration = Duration::from_millis(1);
 
 /// What a federate knows of its place in the federation.
 #[derive(Clone, Debug, Default)]
+#[expect(
+    clippy::struct_excessive_bools,
+    reason = "switches that are independent of each other"
+)]
 pub struct LinkConfig {
     /// The federate's id.
     pub id: u16,
@@ -132,6 +136,10 @@ impl LinkConfig {
 
 /// A network input on the wire.
 #[derive(Clone, Copy, Debug)]
+#[expect(
+    clippy::struct_excessive_bools,
+    reason = "switches that are independent of each other"
+)]
 pub struct InputLink {
     /// The sending federate.
     pub federate: u16,

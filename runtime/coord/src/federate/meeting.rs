@@ -221,7 +221,12 @@ impl Federate {
             Phase::Running | Phase::Draining { .. } => {}
             Phase::Ended => return Ok(bytes.len()),
             // It has heard of the start before this federate has.
-            _ => return Ok(0),
+            Phase::Idle
+            | Phase::Authenticating(_)
+            | Phase::AwaitingAck
+            | Phase::Synchronizing(_)
+            | Phase::Meeting
+            | Phase::AwaitingStart => return Ok(0),
         }
         let Some(link) = &self.link else {
             return Ok(bytes.len());
@@ -230,11 +235,11 @@ impl Federate {
         match ToPeer::decode(bytes, link.peers.wire(), MAX_PAYLOAD) {
             Ok(None) => Ok(0),
             Ok(Some((message, length))) => {
-                self.take_peer_message(now, peer, &message, executor)
-                    .map_err(|error| match error {
-                        Outcome::Protocol(error) => broke(error),
-                        other => other,
-                    })?;
+                let taken = self.take_peer_message(now, peer, &message, executor);
+                if let Err(Outcome::Protocol(error)) = taken {
+                    return Err(broke(error));
+                }
+                taken?;
                 Ok(length)
             }
             Err(error) => Err(broke(error.into())),

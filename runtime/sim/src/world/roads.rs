@@ -299,10 +299,9 @@ impl<E: SimulatedExecutor> World<E> {
                 written_there: there.reading(trip.written),
                 ..trip
             };
-            let port = message.port;
-            let tag = message.tag;
+            let (port, tag) = (message.port, message.tag);
             self.laws.weigh(receiver, &message, trip);
-            self.judge(receiver, port, tag, (decided, counted), trip);
+            self.judge((receiver, port), tag, (decided, counted), trip);
             if counted && let Some(actual) = actual {
                 self.laws.tardy.push((receiver, port, actual));
             }
@@ -315,8 +314,7 @@ impl<E: SimulatedExecutor> World<E> {
 
     fn judge(
         &mut self,
-        receiver: usize,
-        port: u16,
+        (receiver, port): (usize, u16),
         tag: Tag,
         (decided, counted): (Option<bool>, bool),
         trip: Trip,
