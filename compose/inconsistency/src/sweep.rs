@@ -11,6 +11,8 @@ use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
 /// Run every system over periods and STP offsets; write the error rates as CSV and SVG
+///
+/// What else runs on this machine delays nodes beyond the bounds: `chrt -f 10` before the command keeps it away.
 #[derive(Debug, Args)]
 pub(crate) struct Sweep {
     /// The folder for `runs.csv`, `offset.svg` and `period.svg`
