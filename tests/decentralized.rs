@@ -235,6 +235,24 @@ clock: { sync: on, max_error: 100 ms }\ndefaults: { stp_offset: 1 s }";
 }
 
 #[test]
+fn a_clock_that_is_too_uncertain_is_refused_at_the_start() {
+    let sandbox = Sandbox::new();
+    let head = "timeout: 1 s\nclock: { sync: init, max_error: 1 ns }";
+    let file = manifest(&sandbox, "unsure", head, BEAT);
+    let said = sandbox.fails(&["up", &file], 1);
+    assert!(said.contains("clock") && said.contains("1 ns"), "{said}");
+    let view = sandbox.view("unsure");
+    let codes: Vec<&str> = ["beat", "ear"].map(|name| ending(&view, name)).into();
+    assert!(codes.iter().any(|code| code.contains("13")), "{view}");
+    // What is only warned of starts.
+    let head = "timeout: 200 ms\nclock: { sync: init, max_error: 1 ns, on_exceed: warn }";
+    let file = manifest(&sandbox, "warned", head, BEAT);
+    sandbox.ok(&["up", &file]);
+    let view = sandbox.ended("warned");
+    assert_eq!(view["outcome"]["outcome"], "completed", "{view}");
+}
+
+#[test]
 fn the_programs_own_offsets_come_from_the_solver() {
     let sandbox = Sandbox::new();
     let head = "coordination: decentralized\ntimeout: 1 s

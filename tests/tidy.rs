@@ -269,3 +269,31 @@ fn every_module_file_is_used() {
         );
     }
 }
+
+#[test]
+fn every_failure_has_its_tests() {
+    let text = fs::read_to_string(root().join("ARCHITECTURE.md")).unwrap();
+    let heading = "## What happens when something fails";
+    let section = text.split(heading).nth(1).unwrap();
+    let section = section.split("\n## ").next().unwrap();
+    let rows = section
+        .lines()
+        .filter(|line| line.starts_with("| "))
+        .skip(1);
+    let sources: String = tracked(".rs")
+        .iter()
+        .map(|path| fs::read_to_string(path).unwrap())
+        .collect();
+    let mut count = 0;
+    for row in rows {
+        let cell = row.trim_end_matches('|').rsplit('|').next().unwrap();
+        let names: Vec<&str> = cell.split('`').skip(1).step_by(2).collect();
+        assert!(!names.is_empty(), "no test shows: {row}");
+        for name in names {
+            let test = format!("fn {name}(");
+            assert!(sources.contains(&test), "no test is called {name}: {row}");
+        }
+        count += 1;
+    }
+    assert!(count > 15, "{count} rows");
+}

@@ -330,6 +330,24 @@ fn what_the_plan_does_not_allow_ends_the_federate_and_names_the_sender() {
 }
 
 #[test]
+fn tag_arithmetic_that_overflows_ends_the_federate() {
+    let mut world = World::new(&plan("stop-federation", ""));
+    let sender = world.meets(1);
+    world.start();
+    let last = Tag::new(LogicalTime::from_nanos(i64::MAX), 0);
+    let message = ToPeer::TaggedMessage(TaggedMessage {
+        port: 0,
+        federate: 0,
+        tag: last,
+        payload: &[1],
+    });
+    world.says(sender, &message);
+    world.at(10);
+    let outcome = world.outcome();
+    assert!(matches!(outcome, Outcome::Overflow(_)), "{outcome}");
+}
+
+#[test]
 fn a_physical_connection_takes_its_tag_from_the_receivers_clock() {
     let mut world = World::new(&plan("stop-federation", ""));
     let sender = world.meets(2);

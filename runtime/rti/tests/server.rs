@@ -346,6 +346,23 @@ fn a_late_connection_is_refused_at_once() {
 }
 
 #[test]
+fn an_output_queue_beyond_its_limit_ends_the_federation() {
+    let mut options = Options::new("test", 2);
+    options.config.max_output = 1 << 20;
+    let rti = serve(options);
+    let mut flood = rti.join(0, &[], &[1]);
+    let mut deaf = rti.join(1, &[0], &[]);
+    let start = flood.start();
+    assert_eq!(deaf.start(), start);
+    let payload = vec![42; 32 << 10];
+    let mut bytes = Vec::new();
+    message(1, Tag::at(start), &payload).encode(&mut bytes);
+    // Until the RTI has had enough and closes.
+    while flood.stream.write_all(&bytes).is_ok() {}
+    assert_eq!(rti.ended(), 1);
+}
+
+#[test]
 fn a_slow_reader_blocks_nobody() {
     const MESSAGES: usize = 800;
     let rti = serve(Options::new("test", 4));
