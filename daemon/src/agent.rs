@@ -7,6 +7,7 @@
 use std::collections::{BTreeSet, VecDeque};
 use std::time::Duration;
 
+use ictus_coord::plan::OnFailure;
 use ictus_deploy::{FederateKind, Settings};
 
 use crate::api::{
@@ -205,7 +206,13 @@ impl Agent {
         Self {
             rti: Member::new(RTI, true),
             federates: federates
-                .map(|run| Member::new(&run.name, run.kind == FederateKind::Ours))
+                .map(|run| {
+                    let plan = request.plan.federates.get(usize::from(run.id));
+                    Member {
+                        outlived: plan.is_some_and(|it| it.on_failure == OnFailure::Continue),
+                        ..Member::new(&run.name, run.kind == FederateKind::Ours)
+                    }
+                })
                 .collect(),
             settings: request.settings.clone(),
             phase,

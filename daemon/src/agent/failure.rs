@@ -9,10 +9,17 @@ use crate::supervisor::protocol::StopSignal;
 
 impl Agent {
     /// Notes a failure and begins to end the rest.
+    ///
+    /// While it runs, the federation outlives those whose `on_failure` says so.
     pub(super) fn fail(&mut self, now: Now, rank: u8, failure: Failure) {
+        let outlived = self
+            .federates
+            .iter()
+            .any(|member| member.outlived && failure.member.as_ref() == Some(&member.name));
         self.failures.push(Ranked { rank, failure });
         match self.phase {
             Phase::Starting { .. } => self.undo(now, Why::Failure),
+            Phase::Running if outlived => {}
             Phase::Running => self.expect_stop(now, Why::Failure),
             Phase::Stopping { .. } | Phase::Ended(_) => {}
         }

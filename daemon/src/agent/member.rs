@@ -10,6 +10,8 @@ use crate::supervisor::protocol::StopSignal;
 pub(super) struct Member {
     pub(super) name: String,
     pub(super) ours: bool,
+    /// Whether the others go on without it.
+    pub(super) outlived: bool,
     pub(super) process: Process,
     pub(super) pid: Option<u32>,
     pub(super) joined: bool,
@@ -44,6 +46,7 @@ impl Member {
         Self {
             name: name.to_owned(),
             ours,
+            outlived: false,
             process: Process::Waiting,
             pid: None,
             joined: false,

@@ -2,7 +2,7 @@ use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::time::Duration;
 
-use ictus_coord::plan::{FederatePlan, Plan};
+use ictus_coord::plan::{FederatePlan, OnFailure, Plan};
 use ictus_deploy::{FederateKind, FederateRun, Settings, TimingSpec};
 use serde_json::json;
 
@@ -62,8 +62,12 @@ struct World {
 
 impl World {
     fn start() -> Self {
+        Self::start_with(&request())
+    }
+
+    fn start_with(request: &StartRequest) -> Self {
         Self {
-            agent: Agent::start(at(0), &request()),
+            agent: Agent::start(at(0), request),
             now: at(0),
         }
     }
@@ -384,6 +388,24 @@ fn an_rti_that_failed_because_of_a_federate_is_not_the_headline() {
     world.now = at(2);
     world.ends(A, KILLED);
     world.ends(B, Ending::Exited { code: 11 });
+    let Some(Outcome::Failed { failure, .. }) = world.agent.outcome() else {
+        panic!("{:?}", world.agent.outcome());
+    };
+    assert_eq!(failure.member.as_deref(), Some("a"));
+}
+
+#[test]
+fn a_federate_that_may_be_outlived_hurries_nobody_and_is_the_failure_in_the_end() {
+    let mut request = request();
+    request.plan.federates[0].on_failure = OnFailure::Continue;
+    let mut world = World::start_with(&request);
+    world.up();
+    world.actions();
+    world.ends(A, KILLED);
+    assert_eq!(world.agent.poll_timeout(), None, "the others go on");
+    assert_eq!(world.agent.outcome(), None);
+    world.ends(B, Ending::Exited { code: 0 });
+    world.ends(MemberId::Rti, Ending::Exited { code: 1 });
     let Some(Outcome::Failed { failure, .. }) = world.agent.outcome() else {
         panic!("{:?}", world.agent.outcome());
     };

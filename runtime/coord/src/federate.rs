@@ -98,6 +98,8 @@ pub enum FederateEvent {
     },
     /// Somebody who connected was refused; why, in words.
     PeerRefused(String),
+    /// A receiver that the federation may outlive is left behind; who, in words.
+    PeerLeft(String),
     /// The federate falls behind physical time more and more, or has caught up.
     Lag(LagNews),
     /// A message came after its input had been decided at its tag: a sender's first, and then at every power of ten.
@@ -157,6 +159,9 @@ pub enum Outcome {
     /// The connection from another federate ended, though nobody says that it was lost.
     #[error("the connection from federate {0} was cut")]
     PeerCut(u16),
+    /// A receiver takes nothing any more, and what is for it must not be lost.
+    #[error("federate {0} takes nothing any more: what is for it waits in vain")]
+    PeerStuck(u16),
     /// The plan's limit of STP violations was reached: this federate stopped the federation.
     #[error("stopped the federation after {0} STP violations")]
     TooManyViolations(u64),

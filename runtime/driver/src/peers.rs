@@ -9,6 +9,8 @@ use std::net::{IpAddr, Ipv4Addr, SocketAddr, TcpListener};
 
 /// How long one attempt to connect may take.
 const CONNECT_MAX: Duration = Duration::from_secs(2);
+/// How long a receiver may take nothing while the federate cannot go on for what waits for it.
+const STUCK_MAX: Duration = Duration::from_secs(10);
 /// Connections that may be open without having said hello.
 const STRANGERS_MAX: usize = 32;
 
@@ -28,6 +30,8 @@ struct Peer {
     told: bool,
     /// Whether nothing more will be written.
     finished: bool,
+    /// Since when what waits has not become less.
+    stuck_since: Option<PhysicalTime>,
 }
 
 impl Peer {
@@ -38,6 +42,7 @@ impl Peer {
             accepted,
             told: false,
             finished: false,
+            stuck_since: None,
         }
     }
 }
@@ -126,13 +131,19 @@ impl Peers {
     }
 
     /// Writes what the federate has for others, and closes what is over.
-    pub(crate) fn write(&mut self, federate: &mut Federate) {
+    pub(crate) fn write(&mut self, now: PhysicalTime, federate: &mut Federate) {
         for peer in &mut self.connections {
             let out = federate.peer_output(peer.stream);
-            if !out.is_empty() {
+            let before = out.len();
+            if before > 0 {
                 peer.connection.write(out);
             }
             let empty = out.is_empty();
+            if empty || out.len() < before {
+                peer.stuck_since = None;
+            } else {
+                peer.stuck_since.get_or_insert(now);
+            }
             if empty && !peer.finished && federate.peer_over(peer.stream) {
                 peer.connection.finish();
                 peer.finished = true;
@@ -149,6 +160,16 @@ impl Peers {
         }
         self.connections
             .retain(|peer| !(peer.finished && peer.connection.closed()));
+    }
+
+    /// Tells the federate who has taken nothing for too long.
+    pub(crate) fn give_up(&mut self, now: PhysicalTime, federate: &mut Federate) {
+        for peer in &mut self.connections {
+            if peer.stuck_since.is_some_and(|since| now.since(since) > STUCK_MAX) {
+                peer.stuck_since = None;
+                federate.peer_stuck(peer.stream);
+            }
+        }
     }
 
     /// Bytes that wait to be written, of the fullest connection.

@@ -38,6 +38,8 @@ const FLUSH_BYTES: usize = 32 << 10;
 const FLUSH_AGE: Duration = Duration::from_micros(200);
 /// More unwritten bytes than this and no further tag is begun until the socket has taken some.
 const BACKLOG_BYTES: usize = 4 << 20;
+/// How often it is looked whether the socket still takes some.
+const BACKLOG_LOOK: Duration = Duration::from_secs(1);
 /// A federate that never waits still looks at its socket after so many steps.
 const STEPS_PER_LOOK: u32 = 64;
 /// How long a connect is retried: the RTI may start after its federates.
@@ -421,12 +423,14 @@ impl Runner<'_> {
         let pending = self.pending();
         if pending > FLUSH_BYTES || (pending > 0 && now.since(self.written_at) > FLUSH_AGE) {
             self.write(now);
-            while self.pending() > BACKLOG_BYTES {
-                self.wait(now, None)?;
-                let now = self.clock.now();
+            let mut now = now;
+            while self.pending() > BACKLOG_BYTES && self.federate.outcome().is_none() {
+                self.wait(now, Some(now + BACKLOG_LOOK))?;
+                now = self.clock.now();
                 self.guard(now);
                 self.look(now);
                 self.write(now);
+                self.io.peers.give_up(now, &mut self.federate);
             }
         }
         Ok(())
@@ -565,7 +569,7 @@ impl Runner<'_> {
             connection.write(out);
         }
         if !self.io.peers.is_empty() {
-            self.io.peers.write(&mut self.federate);
+            self.io.peers.write(now, &mut self.federate);
         }
     }
 
@@ -594,7 +598,7 @@ impl Runner<'_> {
                     let peers = &mut self.io.peers;
                     peers.connect(&mut self.federate, now, peer, (address, port));
                 }
-                FederateEvent::PeerRefused(words) => {
+                FederateEvent::PeerRefused(words) | FederateEvent::PeerLeft(words) => {
                     drop(writeln!(
                         io::stderr(),
                         "ictus: federate {federate}: {words}"
@@ -674,13 +678,16 @@ impl Runner<'_> {
             return Ok(());
         }
         let until = self.clock.now() + DRAIN_FOR;
-        let mut finished = false;
+        let (mut finished, mut told) = (false, false);
         loop {
             let now = self.clock.now();
             self.write(now);
             let empty = self.federate.output().is_none_or(|out| out.is_empty());
             let peers_empty = self.io.peers.backlog(&mut self.federate) == 0;
-            let Some(connection) = &mut self.io.connection else {
+            let Io {
+                connection, peers, ..
+            } = &mut self.io;
+            let Some(connection) = connection else {
                 return Ok(());
             };
             // Last: who reads what was sent to it may still need the RTI to count this federate as here.
@@ -692,10 +699,14 @@ impl Runner<'_> {
             let count = connection.bytes().len();
             connection.take(count);
             let closed = connection.closed();
-            let Io { peers, .. } = &mut self.io;
+            if closed && !std::mem::replace(&mut told, true) {
+                self.federate.handle_disconnect();
+            }
+            // What senders still bring is too late, and counted.
             peers.read(now, &mut self.federate, &mut self.bodies);
             peers.tidy(&self.federate);
-            if (closed && peers_empty) || now > until {
+            let ended = self.federate.poll(now, &mut self.bodies) == Poll::Ended;
+            if (closed && peers_empty && ended) || now > until {
                 return Ok(());
             }
             self.sleep(!empty, Some(until.since(now)))?;

@@ -98,6 +98,8 @@ impl LinkConfig {
             port_id: plan.connections[*index].port_id,
             delay: connection_delay(&plan.connections[*index]),
             physical: plan.connections[*index].physical,
+            outlived: plan.federates[usize::from(plan.connections[*index].to.federate)].on_failure
+                == OnFailure::Continue,
         };
         let direct = |f: &u16| topology.upstream(me).iter().any(|(u, _)| u.get() == *f);
         let over_others = |f: &u16| {
@@ -195,6 +197,8 @@ pub struct OutputLink {
     pub delay: Delay,
     /// Whether messages go without tag, straight to the receiver.
     pub physical: bool,
+    /// Whether the others go on when the receiver is lost.
+    pub outlived: bool,
 }
 
 /// Whether a tag may be entered as far as the RTI is concerned.

@@ -346,6 +346,24 @@ impl Federate {
         }
     }
 
+    /// The receiver at the other end of `stream` has taken nothing for too long.
+    ///
+    /// One that the others may outlive is left behind: what is for it is dropped. Without any other this federate cannot go on.
+    pub fn peer_stuck(&mut self, stream: PeerStream) {
+        let Some(link) = &mut self.link else { return };
+        let Role::To(peer) = link.peers.role(stream) else {
+            return;
+        };
+        let mut outputs = link.config.outputs.iter();
+        if outputs.any(|output| output.federate == peer && output.outlived) {
+            link.peers.close(stream);
+            let words = format!("federate {peer} takes nothing any more: nothing is sent to it");
+            self.events.push_back(FederateEvent::PeerLeft(words));
+        } else {
+            self.end_with(Outcome::PeerStuck(peer));
+        }
+    }
+
     fn sender_closed(&mut self, now: PhysicalTime, peer: u16) {
         let Some(link) = &mut self.link else { return };
         let mut lost = false;

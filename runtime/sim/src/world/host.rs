@@ -473,7 +473,9 @@ impl<E: SimulatedExecutor> World<E> {
                     self.plan_run(at.max(self.now));
                 }
                 FederateEvent::Connect { peer, .. } => self.meet(federate, peer),
-                FederateEvent::PeerRefused(words) => self.observer.blame("safety", words),
+                FederateEvent::PeerRefused(words) | FederateEvent::PeerLeft(words) => {
+                    self.observer.blame("safety", words);
+                }
                 FederateEvent::Lag(_)
                 | FederateEvent::StpViolation { .. }
                 | FederateEvent::Joined
