@@ -30,8 +30,8 @@ use crate::mutants::Mutant;
 use crate::payload::{FederateExecutor, PayloadError};
 use crate::wire::{DecodeError, RejectReason};
 use ictus_core::{
-    ActionId, Admission, Delay, Duration, Effects, NodeId, NodeKind, OutputId, PhysicalTime,
-    Program, Progress, Tag, Timeline, ValueId,
+    ActionId, ActionKind, Admission, Delay, Duration, Effects, NodeId, NodeKind, OutputId,
+    PhysicalTime, Program, Progress, Tag, Timeline, ValueId,
 };
 use join::Phase;
 pub use link::{InputLink, LinkConfig, OutputLink};
@@ -636,7 +636,7 @@ impl Federate {
     ///
     /// What is written there stays here, because FOREVER was announced.
     fn starve(&mut self) -> Option<Tag> {
-        if self.config.keepalive || self.physical_delay.is_some() {
+        if self.config.keepalive || self.may_wake() {
             return None;
         }
         self.timeline.stop_at(self.timeline.at().successor());
@@ -644,6 +644,20 @@ impl Federate {
             link.fall_silent();
         }
         Some(self.timeline.stop_tag())
+    }
+
+    /// Whether something may come from outside: of a physical action, or over a physical connection whose sender is there.
+    fn may_wake(&self) -> bool {
+        let kinds = self.timeline.program().actions();
+        let inputs = self.timeline.program().network_inputs().iter();
+        let of_inputs: Vec<ActionId> = inputs.filter(|i| i.physical).map(|i| i.action).collect();
+        let inside = kinds.iter().enumerate().any(|(index, kind)| {
+            matches!(kind, ActionKind::Physical { .. })
+                || (matches!(kind, ActionKind::PhysicalConnection { .. })
+                    && !of_inputs.contains(&ActionId::new(index)))
+        });
+        let senders = |link: &Link| !link.peers.all_gone();
+        inside || (!of_inputs.is_empty() && self.link.as_ref().is_none_or(senders))
     }
 
     fn complete(&mut self) {

@@ -329,22 +329,84 @@ fn what_the_plan_does_not_allow_ends_the_federate_and_names_the_sender() {
     }
 }
 
+/// A message that is as late as can be, with the last microstep of the tag reached.
 #[test]
 fn tag_arithmetic_that_overflows_ends_the_federate() {
     let mut world = World::new(&plan("stop-federation", ""));
     let sender = world.meets(1);
     world.start();
-    let last = Tag::new(LogicalTime::from_nanos(i64::MAX), 0);
-    let message = ToPeer::TaggedMessage(TaggedMessage {
-        port: 0,
-        federate: 0,
-        tag: last,
-        payload: &[1],
-    });
-    world.says(sender, &message);
+    let last = Tag::new(LogicalTime::from_nanos(i64::MAX - 1), u32::MAX);
+    for _ in 0..2 {
+        let message = ToPeer::TaggedMessage(TaggedMessage {
+            port: 0,
+            federate: 0,
+            tag: last,
+            payload: &[1],
+        });
+        world.says(sender, &message);
+    }
     world.at(10);
     let outcome = world.outcome();
     assert!(matches!(outcome, Outcome::Overflow(_)), "{outcome}");
+}
+
+#[test]
+fn a_burst_of_tardy_messages_is_taken_at_once() {
+    let mut world = World::new(&plan("stop-federation", ""));
+    let sender = world.meets(1);
+    world.start();
+    world.at(20);
+    let mut bytes = Vec::new();
+    for _ in 0..30_000 {
+        message(0, 0, -1).encode(Wire::V0_12, &mut bytes);
+    }
+    let (now, federate) = (world.now, &mut world.federate);
+    let used = federate.receive_from_peer(now, sender, &bytes, &mut world.notes);
+    assert_eq!(used, bytes.len());
+    assert_eq!(world.federate.counters().stp_violations, 30_000);
+    // Each at a microstep of its own, in order.
+    let actual = world.notes.tardy.iter().map(|(_, actual)| *actual);
+    assert!(actual.is_sorted_by(|a, b| a < b));
+    world.at(21);
+    assert!(world.federate.timeline().at().microstep >= 30_000);
+}
+
+#[test]
+fn a_sender_that_is_cut_amid_a_message_is_lost_whoever_it_is() {
+    for (federate, port) in [(1, 0), (2, 1)] {
+        let mut plan = plan("stop-federation", "");
+        plan.federates[usize::from(federate)].class = None;
+        let mut world = World::new(&plan);
+        let sender = world.meets(federate);
+        world.start();
+        let mut bytes = Vec::new();
+        let half = PeerMessage {
+            port,
+            federate: 0,
+            payload: &[1; 40],
+        };
+        ToPeer::Message(half).encode(Wire::V0_12, &mut bytes);
+        world
+            .federate
+            .receive_from_peer(world.now, sender, &bytes[..20], &mut world.notes);
+        world.federate.peer_closed(world.now, sender, true);
+        assert_eq!(world.at(5_000), Poll::Ended);
+        assert!(matches!(world.outcome(), Outcome::PeerCut(_)));
+    }
+}
+
+#[test]
+fn a_loss_that_the_rti_has_told_is_no_cut() {
+    let mut world = World::new(&plan("stop-federation", ""));
+    let sender = world.meets(1);
+    world.start();
+    world.rti(&ToFederate::FederateLost {
+        federate: 1,
+        promise: Tag::NEVER,
+    });
+    world.federate.peer_closed(world.now, sender, false);
+    world.at(60_000);
+    assert!(world.federate.outcome().is_none());
 }
 
 #[test]
@@ -367,7 +429,7 @@ fn a_cut_that_nobody_explains_ends_the_federate() {
     let mut world = World::new(&plan("stop-federation", ""));
     let sender = world.meets(1);
     world.start();
-    world.federate.peer_closed(world.now, sender);
+    world.federate.peer_closed(world.now, sender, false);
     assert!(matches!(world.at(4_999), Poll::Wait(Some(_))));
     assert_eq!(world.at(5_000), Poll::Ended);
     assert!(matches!(world.outcome(), Outcome::PeerCut(1)));
@@ -387,7 +449,7 @@ fn a_goodbye_and_a_sender_that_may_be_outlived_explain_themselves() {
             });
             world.says(sender, &goodbye);
         }
-        world.federate.peer_closed(world.now, sender);
+        world.federate.peer_closed(world.now, sender, false);
         world.at(60_000);
         assert!(world.federate.outcome().is_none(), "{on_failure}");
         assert_eq!(world.federate.timeline().at(), tag(0));

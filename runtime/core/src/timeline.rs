@@ -141,6 +141,8 @@ struct InputStatus {
     known: Tag,
     /// The tag of the latest message queued or handled.
     last: Tag,
+    /// The tag at which the latest tardy message is handled.
+    tardy: Tag,
 }
 
 impl Timeline {
@@ -156,6 +158,7 @@ impl Timeline {
                     Tag::NEVER
                 },
                 last: Tag::NEVER,
+                tardy: Tag::NEVER,
             })
             .collect();
         let nodes = program.nodes.len();
@@ -433,12 +436,13 @@ impl Timeline {
     }
 
     /// The tag at which a message for `input` with `tag` is due: its own, or a microstep after the last one's when they
-    /// collide on a delayed connection.
+    /// collide (over a delayed connection; over any other only a wrong peer sends two for one tag).
     #[inline]
     #[must_use]
     pub fn due(&self, input: InputId, tag: Tag) -> Tag {
         let last = self.state.inputs[input.index()].last;
-        if self.program.inputs[input.index()].delayed && tag <= last {
+        let delayed = self.program.inputs[input.index()].delayed;
+        if tag <= last && (delayed || tag.time == last.time) {
             last.next_microstep().unwrap_or(Tag::FOREVER)
         } else {
             tag
@@ -467,8 +471,12 @@ impl Timeline {
             state.fire(program, action);
             return Admission::IntoCurrentTag;
         }
-        let next = self.state.at.successor();
+        // After the last tardy one of this input, so that a burst of them need not look for a free microstep.
+        let last = self.state.inputs[input.index()].tardy;
+        let after_last = last.next_microstep().unwrap_or(Tag::NEVER);
+        let next = self.state.at.successor().max(after_last);
         let actual = self.state.enqueue(next, action, value);
+        self.state.inputs[input.index()].tardy = actual;
         self.state.tardiness.queue(actual, action, tag);
         Admission::Tardy {
             intended: tag,

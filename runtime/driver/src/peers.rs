@@ -4,6 +4,7 @@ use crate::bodies::Bodies;
 use crate::transport::{Awaited, Connection};
 use ictus_coord::federate::{Federate, PeerStream};
 use ictus_core::{Duration, PhysicalTime, Tag};
+use std::collections::BTreeSet;
 use std::io;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr, TcpListener};
 
@@ -11,6 +12,8 @@ use std::net::{IpAddr, Ipv4Addr, SocketAddr, TcpListener};
 const CONNECT_MAX: Duration = Duration::from_secs(2);
 /// How long a receiver may take nothing while the federate cannot go on for what waits for it.
 const STUCK_MAX: Duration = Duration::from_secs(10);
+/// Bytes that are read of one sender before the start tag is known.
+const UNSTARTED_MAX: usize = 4 << 20;
 /// Connections that may be open without having said hello.
 const STRANGERS_MAX: usize = 32;
 
@@ -19,6 +22,8 @@ const STRANGERS_MAX: usize = 32;
 pub(crate) struct Peers {
     listener: Option<TcpListener>,
     connections: Vec<Peer>,
+    /// Receivers that could not be reached at first.
+    unreachable: BTreeSet<u16>,
 }
 
 #[derive(Debug)]
@@ -65,21 +70,29 @@ impl Peers {
         self.connections.is_empty() && self.listener.is_none()
     }
 
-    /// Connects to another federate, or says that it cannot be reached now.
+    /// Connects to another federate, or says that it cannot be reached now; in words when it is the first time.
     pub(crate) fn connect(
         &mut self,
         federate: &mut Federate,
         now: PhysicalTime,
         receiver: u16,
         address: ([u8; 4], u16),
-    ) {
+    ) -> Option<String> {
         let address = SocketAddr::from((Ipv4Addr::from(address.0), address.1));
         match Connection::open(address, CONNECT_MAX) {
             Ok(connection) => {
                 let stream = federate.peer_connected(receiver);
                 self.connections.push(Peer::new(stream, connection, false));
+                None
             }
-            Err(_) => federate.peer_unreachable(now, receiver),
+            Err(error) => {
+                federate.peer_unreachable(now, receiver);
+                self.unreachable.insert(receiver).then(|| {
+                    format!(
+                        "cannot connect to federate {receiver} at {address}: {error}; trying on"
+                    )
+                })
+            }
         }
     }
 
@@ -95,7 +108,9 @@ impl Peers {
         let mut drained = true;
         for peer in &mut self.connections {
             let connection = &mut peer.connection;
-            if !connection.closed() {
+            // What comes before the start waits, but not in our memory.
+            let full = !started && connection.bytes().len() > UNSTARTED_MAX;
+            if !connection.closed() && !full {
                 drained &= connection.read();
             }
             let used = federate.receive_from_peer(now, peer.stream, connection.bytes(), bodies);
@@ -104,7 +119,8 @@ impl Peers {
             let offered = connection.bytes().is_empty() || started;
             if connection.closed() && offered && !peer.told {
                 peer.told = true;
-                federate.peer_closed(now, peer.stream);
+                let cut = !connection.bytes().is_empty();
+                federate.peer_closed(now, peer.stream, cut);
             }
         }
         drained
@@ -122,11 +138,12 @@ impl Peers {
             self.connections.push(Peer::new(stream, connection, true));
         }
         let silent = |peer: &Peer| peer.accepted && federate.peer_is_stranger(peer.stream);
-        let strangers = self.connections.iter().filter(|peer| silent(peer)).count();
-        if strangers > STRANGERS_MAX
+        let mut strangers = self.connections.iter().filter(|peer| silent(peer)).count();
+        while strangers > STRANGERS_MAX
             && let Some(oldest) = self.connections.iter().position(silent)
         {
             self.connections.remove(oldest);
+            strangers -= 1;
         }
     }
 
@@ -158,14 +175,19 @@ impl Peers {
             self.connections
                 .retain(|peer| !federate.peer_is_stranger(peer.stream));
         }
+        // Who was refused is not read; others close first, so that nothing is reset that they have not taken.
+        let over = |peer: &Peer| peer.accepted && federate.peer_over(peer.stream);
         self.connections
-            .retain(|peer| !(peer.finished && peer.connection.closed()));
+            .retain(|peer| !(peer.finished && (peer.connection.closed() || over(peer))));
     }
 
     /// Tells the federate who has taken nothing for too long.
     pub(crate) fn give_up(&mut self, now: PhysicalTime, federate: &mut Federate) {
         for peer in &mut self.connections {
-            if peer.stuck_since.is_some_and(|since| now.since(since) > STUCK_MAX) {
+            if peer
+                .stuck_since
+                .is_some_and(|since| now.since(since) > STUCK_MAX)
+            {
                 peer.stuck_since = None;
                 federate.peer_stuck(peer.stream);
             }
@@ -183,11 +205,14 @@ impl Peers {
 
     /// What the federate waits for here.
     pub(crate) fn awaited<'a>(&'a self, federate: &mut Federate) -> Vec<Awaited<'a>> {
+        let started = federate.timeline().start_tag() != Tag::NEVER;
+        let full = move |peer: &&Peer| !started && peer.connection.bytes().len() > UNSTARTED_MAX;
         let connection = |peer: &'a Peer| {
             let wants_write = !federate.peer_output(peer.stream).is_empty();
             Awaited::Connection(&peer.connection, wants_write)
         };
-        let connections = self.connections.iter().map(connection);
+        let read = self.connections.iter().filter(move |peer| !full(peer));
+        let connections = read.map(connection);
         connections
             .chain(self.listener.as_ref().map(Awaited::Listener))
             .collect()

@@ -46,6 +46,8 @@ const STEPS_PER_LOOK: u32 = 64;
 const CONNECT_FOR: Duration = Duration::from_secs(60);
 /// How long the RTI may take to close after RESIGN or FAILED.
 const DRAIN_FOR: Duration = Duration::from_secs(5);
+/// How long a receiver may take nothing of the last messages for it.
+const TAKEN_WITHIN: Duration = Duration::from_secs(30);
 /// How often progress is reported, and trace and timing files are brought up to date.
 const PROGRESS_EVERY: Duration = Duration::from_secs(1);
 
@@ -596,7 +598,13 @@ impl Runner<'_> {
                 } => {
                     let now = self.clock.now();
                     let peers = &mut self.io.peers;
-                    peers.connect(&mut self.federate, now, peer, (address, port));
+                    let words = peers.connect(&mut self.federate, now, peer, (address, port));
+                    if let Some(words) = words {
+                        drop(writeln!(
+                            io::stderr(),
+                            "ictus: federate {federate}: {words}"
+                        ));
+                    }
                 }
                 FederateEvent::PeerRefused(words) | FederateEvent::PeerLeft(words) => {
                     drop(writeln!(
@@ -648,11 +656,15 @@ impl Runner<'_> {
     fn leave(mut self) -> Result<u8, RunError> {
         self.bodies.outside().close();
         let at = self.federate.timeline().at();
-        let (code, reason) = self.verdict();
+        let (mut code, mut reason) = self.verdict();
         self.bodies
             .note_end(at, &reason)
             .map_err(RunError::Observe)?;
-        self.drain()?;
+        let left = self.drain()?;
+        if left > 0 && code == exit::OK {
+            code = exit::FAILED;
+            reason = format!("{left} bytes of the last messages were not taken by their receiver");
+        }
         self.report();
         let started = self.start != Tag::NEVER;
         self.status.say(&FederateStatus::Ended {
@@ -673,25 +685,30 @@ impl Runner<'_> {
     }
 
     /// Writes what is left, half-closes, and reads to the end: a socket closed with unread bytes would lose them.
-    fn drain(&mut self) -> Result<(), RunError> {
+    ///
+    /// Returns how many bytes nobody took.
+    fn drain(&mut self) -> Result<usize, RunError> {
         if self.io.connection.is_none() {
-            return Ok(());
+            return Ok(0);
         }
-        let until = self.clock.now() + DRAIN_FOR;
+        let (mut since, mut left) = (self.clock.now(), usize::MAX);
         let (mut finished, mut told) = (false, false);
         loop {
             let now = self.clock.now();
             self.write(now);
             let empty = self.federate.output().is_none_or(|out| out.is_empty());
-            let peers_empty = self.io.peers.backlog(&mut self.federate) == 0;
+            let waiting = self.io.peers.backlog(&mut self.federate);
+            if waiting < left {
+                (since, left) = (now, waiting);
+            }
             let Io {
                 connection, peers, ..
             } = &mut self.io;
             let Some(connection) = connection else {
-                return Ok(());
+                return Ok(waiting);
             };
             // Last: who reads what was sent to it may still need the RTI to count this federate as here.
-            if empty && peers_empty && !finished {
+            if empty && waiting == 0 && !finished {
                 connection.finish();
                 finished = true;
             }
@@ -706,10 +723,13 @@ impl Runner<'_> {
             peers.read(now, &mut self.federate, &mut self.bodies);
             peers.tidy(&self.federate);
             let ended = self.federate.poll(now, &mut self.bodies) == Poll::Ended;
-            if (closed && peers_empty && ended) || now > until {
-                return Ok(());
+            let until = since + if waiting > 0 { TAKEN_WITHIN } else { DRAIN_FOR };
+            if (closed && waiting == 0 && ended) || now > until {
+                return Ok(waiting);
             }
-            self.sleep(!empty, Some(until.since(now)))?;
+            if self.sleep(!empty, Some(until.since(now)))? {
+                self.take_signals()?;
+            }
         }
     }
 

@@ -7,6 +7,7 @@ use super::{Federate, FederateEvent, Incoming, Outcome, Poll, ProtocolError};
 use crate::mutants::Mutant;
 use crate::payload::FederateExecutor;
 use crate::plan::Wire;
+use crate::wire::kind;
 use crate::wire::{FromPeer, MAX_PAYLOAD, RejectReason, ToPeer, ToRti};
 use ictus_core::{InputId, PhysicalTime, Tag};
 
@@ -162,8 +163,9 @@ impl Federate {
         let Some(link) = &mut self.link else {
             return Ok(bytes.len());
         };
-        let refusal = match ToPeer::decode(bytes, link.peers.wire(), MAX_PAYLOAD) {
-            Ok(None) => return Ok(0),
+        // Nothing is kept of who does not begin with a hello.
+        let refusal = match ToPeer::decode(bytes, link.peers.wire(), 0) {
+            Ok(None) if bytes[0] == kind::P2P_FEDERATE_ID => return Ok(0),
             Ok(Some((
                 ToPeer::Hello {
                     federate,
@@ -175,14 +177,18 @@ impl Federate {
                 Ok(_) => return Ok(length),
                 Err(refusal) => refusal,
             },
-            Ok(Some(_)) | Err(_) => {
+            Ok(None | Some(_)) | Err(_) => {
                 let words = "somebody's first bytes are no hello of a federate".to_owned();
                 (RejectReason::WrongServer, words)
             }
         };
         link.peers.refuse(stream, refusal.0);
         self.counters.refused += 1;
-        self.events.push_back(FederateEvent::PeerRefused(refusal.1));
+        // Strangers may come without end.
+        let count = self.counters.refused;
+        if count <= 10 || 10_u64.pow(count.ilog10()) == count {
+            self.events.push_back(FederateEvent::PeerRefused(refusal.1));
+        }
         Ok(bytes.len())
     }
 
@@ -262,6 +268,11 @@ impl Federate {
                 let input = self.input_from(peer, message.port, message.federate, true)?;
                 self.admit_physical(now, input, message.payload, executor)
             }
+            // What is never due is no message.
+            ToPeer::TaggedMessage(message) if message.tag == Tag::FOREVER => {
+                let (message, phase) = ("a message at the end of time", "running");
+                Err(ProtocolError::Unexpected { message, phase }.into())
+            }
             ToPeer::TaggedMessage(message) => {
                 let input = self.input_from(peer, message.port, message.federate, false)?;
                 let incoming = Incoming {
@@ -323,11 +334,12 @@ impl Federate {
     /// The other end of `stream` has closed it, after everything that it sent was offered.
     ///
     /// A sender that did not say goodbye is lost: its inputs stay unknown until the RTI says what to do; from LF federates,
-    /// which say none, and from those that the others may outlive, nothing comes any more.
-    pub fn peer_closed(&mut self, now: PhysicalTime, stream: PeerStream) {
+    /// which say none, and from those that the others may outlive, nothing comes any more. `cut`: the last message is not
+    /// whole, so that this was no regular end.
+    pub fn peer_closed(&mut self, now: PhysicalTime, stream: PeerStream, cut: bool) {
         let Some(link) = &mut self.link else { return };
         match link.peers.close(stream) {
-            Role::From(peer) => self.sender_closed(now, peer),
+            Role::From(peer) => self.sender_closed(now, peer, cut),
             Role::Greeting(peer) => link.peers.unreachable(now, peer),
             Role::Stranger | Role::To(_) | Role::Over => {}
         }
@@ -364,11 +376,15 @@ impl Federate {
         }
     }
 
-    fn sender_closed(&mut self, now: PhysicalTime, peer: u16) {
+    fn sender_closed(&mut self, now: PhysicalTime, peer: u16, cut: bool) {
         let Some(link) = &mut self.link else { return };
         let mut lost = false;
         for (index, input) in link.config.inputs.iter().enumerate() {
-            if input.federate != peer || input.physical {
+            if input.federate != peer {
+                continue;
+            }
+            lost |= cut && !input.outlived;
+            if input.physical {
                 continue;
             }
             let input_id = InputId::new(index);
@@ -379,7 +395,8 @@ impl Federate {
                 lost |= self.timeline.known(input_id) < Tag::FOREVER;
             }
         }
-        if lost {
+        // The RTI may have said so already.
+        if lost && !self.stop.has_lost(peer) {
             let until = now.saturating_add(super::LOSS_EXPLAINED_WITHIN);
             self.unexplained.get_or_insert((peer, until));
         }

@@ -5,6 +5,7 @@ use super::{Federate, FederateEvent, Outcome, Poll};
 use crate::mutants::Mutant;
 use crate::wire::ToRti;
 use ictus_core::{InputId, PhysicalTime, Tag, Timeline};
+use std::collections::BTreeSet;
 
 /// What a stop in progress allows.
 #[derive(Debug, Default)]
@@ -13,6 +14,7 @@ pub(super) struct Stop {
     /// The last tag at which a lost federate's silence is no false absence.
     limit: Option<Tag>,
     lost: Option<u16>,
+    all_lost: BTreeSet<u16>,
     violated: bool,
     abandoned: Option<Outcome>,
 }
@@ -66,6 +68,11 @@ impl Stop {
     /// Whether reactions that wait for inputs at `at` wait in vain: what they wait for is lost.
     pub(super) fn gives_up(&self, at: Tag) -> bool {
         self.abandoned.is_some() || (self.consensus == Consensus::Granted && self.past_limit(at))
+    }
+
+    /// Whether the RTI has said that `federate` is lost.
+    pub(super) fn has_lost(&self, federate: u16) -> bool {
+        self.all_lost.contains(&federate)
     }
 
     /// The stop that is asked for next is because of STP violations.
@@ -153,7 +160,8 @@ impl Federate {
 
     /// Takes FEDERATE_LOST: after `limit`, an absence could be a lie.
     pub(super) fn peer_lost(&mut self, federate: u16, limit: Tag) {
-        self.unexplained = None;
+        self.unexplained = self.unexplained.filter(|(peer, _)| *peer != federate);
+        self.stop.all_lost.insert(federate);
         let limit = if self.has_mutant(Mutant::PromiseIgnored) {
             Tag::FOREVER
         } else if self.is_decentralized() {

@@ -3,18 +3,21 @@
 use crate::id::{ActionId, NodeId, SlotId};
 use crate::program::Program;
 use crate::tag::Tag;
+use std::cmp::Reverse;
+use std::collections::BinaryHeap;
 
 /// Tardy events that wait, and tardy nodes of the current tag. Both are empty as long as no message was late.
 #[derive(Debug)]
 pub(super) struct Tardiness {
-    queued: Vec<TardyEvent>,
+    queued: BinaryHeap<Reverse<TardyEvent>>,
     /// Nodes that are ready or in flight.
     nodes: Vec<NodeId>,
     /// By node id: the intended tag of those in `nodes`; FOREVER for the others.
     intended: Vec<Tag>,
 }
 
-#[derive(Debug)]
+/// In order of the tags at which they are handled.
+#[derive(Debug, PartialEq, Eq, PartialOrd, Ord)]
 struct TardyEvent {
     actual: Tag,
     action: ActionId,
@@ -24,14 +27,14 @@ struct TardyEvent {
 impl Tardiness {
     pub(super) fn new(nodes: usize) -> Self {
         Self {
-            queued: Vec::new(),
+            queued: BinaryHeap::new(),
             nodes: Vec::new(),
             intended: vec![Tag::FOREVER; nodes],
         }
     }
 
     #[inline]
-    pub(super) const fn any_queued(&self) -> bool {
+    pub(super) fn any_queued(&self) -> bool {
         !self.queued.is_empty()
     }
 
@@ -46,11 +49,11 @@ impl Tardiness {
     }
 
     pub(super) fn queue(&mut self, actual: Tag, action: ActionId, intended: Tag) {
-        self.queued.push(TardyEvent {
+        self.queued.push(Reverse(TardyEvent {
             actual,
             action,
             intended,
-        });
+        }));
     }
 
     pub(super) fn drop_queued(&mut self) {
@@ -60,17 +63,14 @@ impl Tardiness {
     /// Marks what the tardy events due at `tag` trigger.
     #[cold]
     pub(super) fn fire(&mut self, tag: Tag, program: &Program) {
-        let mut queued = std::mem::take(&mut self.queued);
-        queued.retain(|event| {
-            if event.actual <= tag {
-                self.mark(
-                    &program.action_triggers[event.action.index()],
-                    event.intended,
-                );
+        while let Some(Reverse(event)) = self.queued.peek() {
+            if event.actual > tag {
+                return;
             }
-            event.actual > tag
-        });
-        self.queued = queued;
+            let (action, intended) = (event.action, event.intended);
+            self.queued.pop();
+            self.mark(&program.action_triggers[action.index()], intended);
+        }
     }
 
     /// Marks what the tardy nodes of `batch`, which is done, triggered by setting `slots`.

@@ -241,7 +241,8 @@ impl<E: SimulatedExecutor> World<E> {
         if road.ended && !road.told && (started || road.arrived.is_empty()) {
             road.told = true;
             let now = host.clock.reading(self.now);
-            host.federate.peer_closed(now, road.at_receiver);
+            let cut = !road.arrived.is_empty();
+            host.federate.peer_closed(now, road.at_receiver, cut);
         }
     }
 
