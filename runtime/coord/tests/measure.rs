@@ -43,12 +43,26 @@ proptest! {
     }
 
     #[test]
-    fn count_sum_and_max_are_exact(spans in prop::collection::vec(-5_i64..1 << 40, 0..200)) {
+    fn a_floor_is_at_most_an_eighth_below_the_exact_one(mut spans in spans(), q in 0.0_f64..=1.0) {
+        let histogram = histogram(&spans);
+        spans.iter_mut().for_each(|nanos| *nanos = (*nanos).max(0));
+        spans.sort_unstable();
+        let rank = (q * spans.len() as f64).ceil() as usize;
+        let exact = spans.get(rank.saturating_sub(1)).copied().unwrap_or(0);
+        let said = histogram.quantile_floor(q).as_nanos();
+        prop_assert!(said <= exact, "{said} > {exact}");
+        prop_assert!(exact - said <= exact / 8, "{said} << {exact}");
+    }
+
+    #[test]
+    fn count_sum_min_and_max_are_exact(spans in prop::collection::vec(-5_i64..1 << 40, 0..200)) {
         let histogram = histogram(&spans);
         let positive = || spans.iter().map(|nanos| (*nanos).max(0));
         prop_assert_eq!(histogram.count(), spans.len() as u64);
         prop_assert_eq!(histogram.sum_ns(), positive().sum::<i64>() as u64);
         prop_assert_eq!(histogram.max().as_nanos(), positive().max().unwrap_or(0));
+        prop_assert_eq!(histogram.min().as_nanos(), positive().min().unwrap_or(0));
+        prop_assert_eq!(histogram.quantile_floor(0.0), histogram.min());
         prop_assert_eq!(histogram.buckets().map(|(_, n)| n).sum::<u64>(), histogram.count());
     }
 
@@ -103,6 +117,14 @@ fn small_values_have_buckets_of_their_own() {
     assert_eq!(histogram.quantile(f64::NAN), Duration::from_nanos(18));
 }
 
+/// What was written before there was a minimum has its first bucket's lower edge.
+#[test]
+fn a_record_without_a_minimum_reads() {
+    let line = r#"{"sum":36,"max":19,"buckets":[16,1,0,1]}"#;
+    let old: Histogram = serde_json::from_str(line).unwrap();
+    assert_eq!((old.min(), old.count()), (Duration::from_nanos(16), 2));
+}
+
 #[test]
 fn damaged_histograms_are_refused() {
     for (line, why) in [
@@ -133,6 +155,14 @@ fn damaged_histograms_are_refused() {
         (
             r#"{"sum":1,"max":5,"buckets":[]}"#,
             "a maximum outside the last bucket",
+        ),
+        (
+            r#"{"sum":1,"min":0,"max":1,"buckets":[1,1]}"#,
+            "a minimum outside the first bucket",
+        ),
+        (
+            r#"{"sum":2,"min":17,"max":16,"buckets":[16,1]}"#,
+            "a minimum outside the first bucket",
         ),
     ] {
         let error = serde_json::from_str::<Histogram>(line)

@@ -13,15 +13,16 @@ const BUCKETS: usize = (63 - SUB_BITS as usize + 1) * SUBS;
 
 /// A histogram of durations: log-linear, 8 sub-buckets per power of two, in nanoseconds.
 ///
-/// Count, sum and maximum are exact (the sum saturates). A negative duration counts as 0.
-/// Laws: a quantile is at most 1/8 above the exact one and never below it; `merge` equals recording both sequences;
-/// the serialized form reads back as the same histogram.
+/// Count, sum, minimum and maximum are exact (the sum saturates). A negative duration counts as 0.
+/// Laws: a quantile is at most 1/8 above the exact one and never below it, a floor of one at most 1/8 below and never above;
+/// `merge` equals recording both sequences; the serialized form reads back as the same histogram.
 #[derive(Clone, Debug, PartialEq, Eq, Deserialize)]
 #[serde(try_from = "Sparse")]
 pub struct Histogram {
     counts: Box<[u64]>,
     count: u64,
     sum: u64,
+    min: u64,
     max: u64,
 }
 
@@ -37,6 +38,9 @@ pub enum HistogramError {
     /// A listed bucket is empty, or all together overflow.
     #[error("a count out of range")]
     Count,
+    /// The smallest value does not lie in the first bucket.
+    #[error("a minimum outside the first bucket")]
+    Min,
     /// The largest value does not lie in the last bucket.
     #[error("a maximum outside the last bucket")]
     Max,
@@ -46,6 +50,9 @@ pub enum HistogramError {
 #[derive(Serialize, Deserialize)]
 struct Sparse {
     sum: u64,
+    /// Absent in what older releases wrote, and when nothing was counted.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    min: Option<u64>,
     max: u64,
     buckets: Vec<u64>,
 }
@@ -56,6 +63,7 @@ impl Default for Histogram {
             counts: vec![0; BUCKETS].into_boxed_slice(),
             count: 0,
             sum: 0,
+            min: 0,
             max: 0,
         }
     }
@@ -68,6 +76,11 @@ impl Histogram {
         if let Some(count) = self.counts.get_mut(bucket(nanos)) {
             *count += 1;
         }
+        self.min = if self.is_empty() {
+            nanos
+        } else {
+            self.min.min(nanos)
+        };
         self.count += 1;
         self.sum = self.sum.saturating_add(nanos);
         self.max = self.max.max(nanos);
@@ -78,6 +91,11 @@ impl Histogram {
         for (mine, theirs) in self.counts.iter_mut().zip(&other.counts) {
             *mine = mine.saturating_add(*theirs);
         }
+        self.min = match (self.is_empty(), other.is_empty()) {
+            (true, _) => other.min,
+            (false, true) => self.min,
+            (false, false) => self.min.min(other.min),
+        };
         self.count = self.count.saturating_add(other.count);
         self.sum = self.sum.saturating_add(other.sum);
         self.max = self.max.max(other.max);
@@ -108,6 +126,12 @@ impl Histogram {
         self.sum
     }
 
+    /// The shortest duration; zero when nothing was counted.
+    #[must_use]
+    pub fn min(&self) -> Duration {
+        duration(self.min)
+    }
+
     /// The longest duration; zero when nothing was counted.
     #[must_use]
     pub fn max(&self) -> Duration {
@@ -124,16 +148,32 @@ impl Histogram {
     /// nothing was counted. `q` is 0 to 1; what is beyond counts as the end it is beyond.
     #[must_use]
     pub fn quantile(&self, q: f64) -> Duration {
-        #[expect(clippy::cast_precision_loss, reason = "a rank of 2^53 is out of reach")]
+        let bucket = self.ranked(q);
+        bucket.map_or(self.max(), |index| {
+            duration(upper_edge(index)).min(self.max())
+        })
+    }
+
+    /// The lower edge of the bucket in which `quantile` lies, and never less than the minimum: for durations of which the short
+    /// ones are the bad ones. Zero when nothing was counted.
+    #[must_use]
+    pub fn quantile_floor(&self, q: f64) -> Duration {
+        let bucket = self.ranked(q);
+        bucket.map_or(self.max(), |index| {
+            duration(lower_edge(index)).max(self.min())
+        })
+    }
+
+    /// The first bucket up to which at least a share `q` was counted.
+    #[expect(clippy::cast_precision_loss, reason = "a rank of 2^53 is out of reach")]
+    fn ranked(&self, q: f64) -> Option<usize> {
         let (rank, mut seen) = (q * self.count as f64, 0_u64);
-        for (edge, count) in self.buckets() {
-            seen = seen.saturating_add(count);
-            #[expect(clippy::cast_precision_loss, reason = "as above")]
-            if seen as f64 >= rank {
-                return edge.min(self.max());
-            }
-        }
-        self.max()
+        let mut full = self.counts.iter().enumerate().filter(|(_, n)| **n > 0);
+        let found = full.find(|(_, count)| {
+            seen = seen.saturating_add(**count);
+            seen as f64 >= rank
+        });
+        found.map(|(index, _)| index)
     }
 
     /// The buckets that counted something, ascending: upper edge (inclusive), count.
@@ -166,6 +206,14 @@ const fn upper_edge(index: usize) -> u64 {
     ((sub as u64 + 1) << shift) - 1
 }
 
+/// The smallest value in a bucket.
+const fn lower_edge(index: usize) -> u64 {
+    match index.checked_sub(1) {
+        Some(before) => upper_edge(before) + 1,
+        None => 0,
+    }
+}
+
 fn duration(nanos: u64) -> Duration {
     Duration::from_nanos(i64::try_from(nanos).unwrap_or(i64::MAX))
 }
@@ -190,6 +238,7 @@ impl From<&Histogram> for Sparse {
         }
         Self {
             sum: histogram.sum,
+            min: (!histogram.is_empty()).then_some(histogram.min),
             max: histogram.max,
             buckets,
         }
@@ -206,6 +255,7 @@ impl TryFrom<Sparse> for Histogram {
             return Err(HistogramError::Odd);
         }
         let (mut next, mut last) = (0_usize, 0);
+        let mut first = None;
         for [gap, count] in pairs {
             let gap = usize::try_from(*gap).map_err(|_| HistogramError::Bucket)?;
             last = next.checked_add(gap).ok_or(HistogramError::Bucket)?;
@@ -213,11 +263,18 @@ impl TryFrom<Sparse> for Histogram {
             *place.ok_or(HistogramError::Bucket)? = *count;
             let sum = histogram.count.checked_add(*count);
             histogram.count = sum.filter(|_| *count > 0).ok_or(HistogramError::Count)?;
+            first.get_or_insert(last);
             next = last + 1;
         }
         if bucket(sparse.max) != last || sparse.max > i64::MAX.unsigned_abs() {
             return Err(HistogramError::Max);
         }
+        let first = first.unwrap_or(0);
+        let min = sparse.min.unwrap_or(lower_edge(first));
+        if bucket(min) != first || min > sparse.max {
+            return Err(HistogramError::Min);
+        }
+        histogram.min = min;
         histogram.sum = sparse.sum;
         histogram.max = sparse.max;
         Ok(histogram)
