@@ -10,7 +10,10 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
+use ictus_coord::measure::Upstream;
 use ictus_coord::plan::{ClockPlan, ClockSync, Coordination, OnFailure, Wire};
+use ictus_coord::report::{FederateMeasures, FederationMeasures};
+use ictus_deploy::timing::suggest;
 use ictus_deploy::{CheckOptions, Checked, FederateKind, Problems, Progress, check};
 
 /// A folder with a manifest and `bin/NAME` for every name the fake program knows.
@@ -437,4 +440,29 @@ fn foreign_ids_come_first() {
             }
         ]
     );
+}
+
+/// What `ictus timing --suggest` prints without synchronized clocks is a section with which the manifest has no mistake.
+#[test]
+fn a_suggestion_can_be_pasted() {
+    let manifest = "ictus: v1\nfederation: f\nprograms: { fake: { binary: bin/fake } }\n\
+        coordination: decentralized\nfederates:\n  a: { class: Relay }\n  b: { class: Relay, OFFSET }\n\
+        connections:\n  - { from: a.out, to: b.input }\n";
+    let first = Bench::new(&manifest.replace("OFFSET", "stp_offset: 50 ms"));
+    let plan = first.check(&CheckOptions::default()).unwrap().plan;
+    let mut upstream = Upstream::default();
+    upstream
+        .arrival
+        .record(ictus_core::Duration::from_nanos(2_000_000));
+    let mut measures = FederateMeasures::of("b");
+    measures.upstreams.insert("a".to_owned(), upstream);
+    let measures = FederationMeasures {
+        federation: "f".to_owned(),
+        federates: vec![measures],
+    };
+    let section = suggest(&plan, &measures, 20).to_string();
+    let pasted = manifest.replace("OFFSET", "stp_offset: auto") + &section + "\n";
+    let checked = Bench::new(&pasted).check(&CheckOptions::default());
+    let plan = checked.unwrap_or_else(|p| panic!("{section}\n{p}")).plan;
+    assert_eq!(plan.federates[1].stp_offset_ns, 2_400_000);
 }

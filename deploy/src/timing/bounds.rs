@@ -48,8 +48,10 @@ pub struct BoundsRow {
     pub measured: Option<Spread>,
     /// By how much the two clocks may falsify the measured figures, in nanoseconds, as far as it is known.
     pub band_ns: Option<i64>,
-    /// Declared less the largest measured, in nanoseconds; negative when the bound was broken.
+    /// Declared less the largest measured, in nanoseconds; negative when the bound was broken; absent for an estimate.
     pub margin_ns: Option<i64>,
+    /// S of the sender, from whose end arrivals are measured, in nanoseconds; absent when it is 0 and for other rows.
+    pub sender_offset_ns: Option<i64>,
 }
 
 /// What a row is about.
@@ -64,7 +66,7 @@ pub enum Measure {
     Slack,
     /// How much too late.
     Lateness,
-    /// L + N at the receiver, by both clocks.
+    /// L + N at the receiver, by both clocks, from the end of the sender's offset.
     Arrival,
     /// N: the arrivals less the sender's median L.
     Latency,
@@ -72,7 +74,7 @@ pub enum Measure {
     ClockError,
 }
 
-/// Figures in nanoseconds.
+/// Figures in nanoseconds, each on the side that is not optimistic: slack is rounded down, everything else up.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
 pub struct Spread {
     /// How many were measured.
@@ -109,6 +111,8 @@ pub struct LinkSuggestion {
     pub latency_ns: Option<i64>,
     /// E.
     pub clock_error_ns: Option<i64>,
+    /// What the plan declares, in place of what was not measured; absent when nothing is.
+    pub declared: Option<Bounds>,
 }
 
 /// Puts what a plan declares beside what was measured. Absent under centralized coordination, where nothing waits for
@@ -258,12 +262,12 @@ impl<'a> Survey<'a> {
         let base = self.offset(pair.from) - after.min().unwrap_or(0);
         let needed = upstream.and_then(|it| needed(wait, base, it));
         let slack = upstream.and_then(|it| {
-            let at = |q: f64| it.slack.quantile(q).as_nanos();
+            let at = |q: f64| it.slack.quantile_floor(q).as_nanos();
             (!it.slack.is_empty()).then(|| Spread {
                 count: it.slack.count(),
                 p50_ns: at(0.5),
                 p99_ns: at(0.01),
-                max_ns: at(0.0),
+                max_ns: it.slack.min().as_nanos(),
             })
         });
         let lateness = upstream.and_then(|it| Spread::of(&it.lateness));
@@ -298,13 +302,20 @@ impl<'a> Survey<'a> {
             rows.push(BoundsRow::new(Measure::Lateness, name, None, lateness));
         }
         rows.extend([
-            banded(BoundsRow::new(Measure::Arrival, name, sum, arrival)),
-            banded(BoundsRow::new(
-                Measure::Latency,
-                name,
-                of(|it| it.latency_ns),
-                latency,
-            )),
+            BoundsRow {
+                sender_offset_ns: Some(self.offset(pair.from)).filter(|ns| *ns > 0),
+                ..banded(BoundsRow::new(Measure::Arrival, name, sum, arrival))
+            },
+            // The largest arrival less the median L may exceed N although N was kept: no margin.
+            BoundsRow {
+                margin_ns: None,
+                ..banded(BoundsRow::new(
+                    Measure::Latency,
+                    name,
+                    of(|it| it.latency_ns),
+                    latency,
+                ))
+            },
             BoundsRow::new(Measure::ClockError, name, of(|it| it.clock_error_ns), error),
         ]);
         rows
@@ -340,6 +351,7 @@ impl<'a> Survey<'a> {
             launch_lag_ns,
             latency_ns,
             clock_error_ns: self.band(pair).map(|ns| rounded_up(ns, 0)),
+            declared: declared(pair),
         }
     }
 }
@@ -368,8 +380,9 @@ fn declared(pair: &Pair<'_>) -> Option<Bounds> {
 }
 
 /// How long after their tags' times messages came, when the receiver waits so long: `wait` less the slack of those in time,
-/// `wait` and the lateness of the others. Slack ends at 0 for one that came after the wait but harmed nobody; `base` and
-/// its arrival tell how late it was.
+/// `wait` and the lateness of the others; never less than was needed. The buckets of slack are wide where the wait is long, so
+/// its quantiles give way to those of the arrivals, from `base` on, which are as sure. They also tell how late one was
+/// that came after the wait but harmed nobody: its slack is 0. An arrival of 0 tells nothing: it may have come before `base`.
 #[expect(
     clippy::cast_precision_loss,
     reason = "a share of counts; 2^53 messages are out of reach"
@@ -386,29 +399,37 @@ fn needed(wait: i64, base: i64, upstream: &Upstream) -> Option<Spread> {
     if count == 0 {
         return None;
     }
+    let by_arrival = |share: f64| {
+        let span = arrival.quantile(share).as_nanos();
+        (span > 0).then(|| base.saturating_add(span))
+    };
+    let in_time = |share: f64| {
+        let at_least = wait.saturating_sub(slack.quantile(1.0 - share).as_nanos());
+        let at_most = wait.saturating_sub(slack.quantile_floor(1.0 - share).as_nanos());
+        by_arrival(share)
+            .filter(|ns| *ns >= at_least)
+            .unwrap_or(at_most)
+    };
     let at = |q: f64| {
         let rank = q * count as f64;
         if rank <= early as f64 {
-            let share = rank / early as f64;
-            let by_slack = wait.saturating_sub(slack.quantile(1.0 - share).as_nanos());
-            let by_arrival = base.saturating_add(arrival.quantile(share).as_nanos());
-            if by_slack == wait {
-                wait.max(by_arrival)
-            } else {
-                by_slack
-            }
+            in_time(rank / early as f64)
         } else {
             let share = (rank - early as f64) / late as f64;
             wait.saturating_add(lateness.quantile(share).as_nanos())
         }
     };
+    // Least slack, greatest lateness and greatest arrival are exact.
+    let least = (early > 0).then(|| wait.saturating_sub(slack.min().as_nanos()));
+    let most = (late > 0).then(|| wait.saturating_add(lateness.max().as_nanos()));
     let p50_ns = at(0.5);
     let p99_ns = at(0.99).max(p50_ns);
+    let max_ns = least.into_iter().chain(most).chain(by_arrival(1.0)).max();
     Some(Spread {
         count,
         p50_ns,
         p99_ns,
-        max_ns: at(1.0).max(p99_ns),
+        max_ns: max_ns.map_or(p99_ns, |ns| ns.max(p99_ns)),
     })
 }
 
@@ -441,6 +462,7 @@ impl BoundsRow {
             measured,
             band_ns: None,
             margin_ns: margin.map(|(declared, spread)| declared.saturating_sub(spread.max_ns)),
+            sender_offset_ns: None,
         }
     }
 }
@@ -452,8 +474,8 @@ impl fmt::Display for BoundsReport {
             .map(|row| row.label().chars().count())
             .max()
             .unwrap_or(0);
-        let head = ["declared", "p50", "p99", "max", "margin"].map(|word| format!("{word:>10}"));
-        write!(f, "{:wide$}  {}{:>9}", "bounds, in ms", head.concat(), "n")?;
+        let head = ["declared", "p50", "p99", "max", "margin"].map(column);
+        write!(f, "{:wide$}  {} {:>8}", "bounds, in ms", head.concat(), "n")?;
         for federate in &self.federates {
             write!(f, "\n{federate}")?;
             for row in &federate.rows {
@@ -474,7 +496,7 @@ impl fmt::Display for FederateBounds {
             write!(f, ", required {}", tenths(required))?;
         }
         match self.clock_bound_ns {
-            Some(bound) => write!(f, "; E {}", fixed(bound))?,
+            Some(bound) => write!(f, "; E {}", at_most(bound))?,
             None => write!(f, "; E unknown")?,
         }
         write!(f, "; violations {}", self.violations)
@@ -487,12 +509,15 @@ impl BoundsRow {
         let peer = &self.peer;
         let band = self
             .band_ns
-            .map_or(String::new(), |ns| format!(" (+-{})", fixed(ns)));
+            .map_or(String::new(), |ns| format!(" (+-{})", at_most(ns)));
         match self.what {
             Measure::LaunchLag => format!("L to {peer}"),
             Measure::Offset => format!("S for {peer}"),
             Measure::Slack => format!("slack of {peer} (p50, p1, least)"),
             Measure::Lateness => format!("too late from {peer}"),
+            Measure::Arrival if self.sender_offset_ns.is_some() => {
+                format!("L+N after S of {peer}{band}")
+            }
             Measure::Arrival => format!("L+N from {peer}{band}"),
             Measure::Latency => format!("N from {peer}, estimate"),
             Measure::ClockError => format!("E with {peer}"),
@@ -501,31 +526,49 @@ impl BoundsRow {
 
     /// The figures, each in its column.
     fn cells(&self) -> String {
-        let cell = |ns: Option<i64>| ns.map_or("-".to_owned(), fixed);
-        let of = |figure: fn(Spread) -> i64| cell(self.measured.map(figure));
+        let measured: fn(i64) -> String = match self.what {
+            Measure::Slack => at_least,
+            Measure::LaunchLag
+            | Measure::Offset
+            | Measure::Lateness
+            | Measure::Arrival
+            | Measure::Latency
+            | Measure::ClockError => at_most,
+        };
+        let cell = |ns: Option<i64>, text: fn(i64) -> String| ns.map_or("-".to_owned(), text);
+        let of = |figure: fn(Spread) -> i64| cell(self.measured.map(figure), measured);
         let cells = [
-            cell(self.declared_ns),
+            cell(self.declared_ns, at_least),
             of(|it| it.p50_ns),
             of(|it| it.p99_ns),
             of(|it| it.max_ns),
-            cell(self.margin_ns),
+            cell(self.margin_ns, at_least),
         ];
         let count = match (self.what, self.measured) {
             (Measure::ClockError, _) => String::new(),
             (_, spread) => spread.map_or(0, |it| it.count).to_string(),
         };
-        format!(
-            "{}{count:>9}",
-            cells.map(|cell| format!("{cell:>10}")).concat()
-        )
+        let cells = cells.each_ref().map(|cell| column(cell));
+        format!("{} {count:>8}", cells.concat())
     }
 }
 
-/// Milliseconds with three decimals.
-fn fixed(ns: i64) -> String {
-    let micros = ns.unsigned_abs() / 1_000;
-    let sign = if ns < 0 { "-" } else { "" };
+/// A cell, never without a space before it.
+fn column(cell: &str) -> String {
+    format!(" {cell:>9}")
+}
+
+/// Milliseconds with three decimals, rounded down.
+fn at_least(ns: i64) -> String {
+    let micros = ns.div_euclid(1_000);
+    let sign = if micros < 0 { "-" } else { "" };
+    let micros = micros.unsigned_abs();
     format!("{sign}{}.{:03}", micros / 1_000, micros % 1_000)
+}
+
+/// Milliseconds with three decimals, rounded up.
+fn at_most(ns: i64) -> String {
+    at_least(ns.saturating_add(999))
 }
 
 impl Suggestion {
@@ -542,14 +585,22 @@ impl Suggestion {
     }
 }
 
-/// A bound's name in the manifest, and where a link has it.
-type Term = (&'static str, fn(&LinkSuggestion) -> Option<i64>);
+/// A bound's name in the manifest, where a link has it, and where declared bounds have it.
+type Term = (
+    &'static str,
+    fn(&LinkSuggestion) -> Option<i64>,
+    fn(Bounds) -> i64,
+);
 
 /// The bounds in the manifest's order.
 const TERMS: [Term; 3] = [
-    ("launch_lag", |one| one.launch_lag_ns),
-    ("latency", |one| one.latency_ns),
-    ("clock_error", |one| one.clock_error_ns),
+    ("launch_lag", |one| one.launch_lag_ns, |it| it.launch_lag_ns),
+    ("latency", |one| one.latency_ns, |it| it.latency_ns),
+    (
+        "clock_error",
+        |one| one.clock_error_ns,
+        |it| it.clock_error_ns,
+    ),
 ];
 
 impl fmt::Display for Suggestion {
@@ -563,15 +614,22 @@ impl fmt::Display for Suggestion {
             f,
             "# The largest measured values and {margin} % more.\nbounds:"
         )?;
-        for (name, term) in TERMS {
-            match self.general(term) {
-                Some(ns) => write!(f, "\n  {name}: {}", span(ns))?,
-                None => write!(f, "\n  # {name}: not measured")?,
+        for (name, term, declared) in TERMS {
+            let promised = self
+                .links
+                .iter()
+                .filter_map(|link| link.declared.map(declared));
+            match (self.general(term), promised.max()) {
+                (Some(ns), _) => write!(f, "\n  {name}: {}", span(ns))?,
+                (None, Some(ns)) => {
+                    write!(f, "\n  {name}: {}   # declared, not measured", span(ns))?;
+                }
+                (None, None) => write!(f, "\n  {name}: 0 s   # not measured")?,
             }
         }
         write!(f, "\n  links:")?;
         for link in &self.links {
-            let terms = TERMS.iter().filter_map(|(name, term)| {
+            let terms = TERMS.iter().filter_map(|(name, term, _)| {
                 let ns = term(link)?;
                 Some(format!("{name}: {}", span(ns)))
             });
