@@ -44,7 +44,8 @@ pub(crate) const CODES: &[(&str, &str)] = &[
         "F006",
         "A duration or size that cannot be read. Both need a unit, also for zero: `10 ms`, `0 s`, \
          `10 MiB`. Units of time: ns, us, ms, s, min, h. Units of size: B, kB, KiB, MB, MiB, GB, \
-         GiB.",
+         GiB. Nothing is negative or infinite, and an offset, or a bound that \
+         one is made of, is at most an hour.",
     ),
     (
         "F007",
@@ -162,7 +163,7 @@ pub(crate) const CODES: &[(&str, &str)] = &[
          none. Around a cycle of connections a message becomes later each time, because launch \
          lags, latencies and clock errors add up to more than the `after` delays; so no federate of \
          it can wait long enough. Give the cycle more `after`, declare smaller bounds if they hold, \
-         or coordinate centrally.",
+         or coordinate centrally. An offset of more than an hour is refused too: it is a mistake.",
     ),
     (
         "W001",
@@ -172,7 +173,7 @@ pub(crate) const CODES: &[(&str, &str)] = &[
     (
         "W003",
         "The key does nothing here: offsets belong to decentralized coordination, `max_lead` to \
-         centralized; a physical connection has no tag to be late for; a foreign federate cannot be \
+         centralized; a federate without inputs waits for nobody; a physical connection has no tag to be late for; a foreign federate cannot be \
          told; without clock synchronization no error is measured.",
     ),
     (

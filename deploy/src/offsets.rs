@@ -9,6 +9,7 @@ use serde::Serialize;
 use crate::federation::Member;
 use crate::manifest::{Connection, Manifest, TimeSpan, split_link};
 use crate::problem::{Place, Report};
+use crate::spans::LONGEST_NS;
 use crate::suggest;
 use crate::wiring::Wire;
 
@@ -37,6 +38,8 @@ pub struct FederateOffset {
     pub used_ns: i64,
     /// When it has decided all its inputs at the latest: what its receivers reckon with.
     pub decided_ns: i64,
+    /// Whether an input waits at all; without one a declared offset has no effect.
+    pub waits: bool,
     /// The link that requires most, as an index of [`Offsets::links`]; absent without inputs.
     pub by: Option<usize>,
 }
@@ -109,6 +112,13 @@ impl fmt::Display for Offsets {
             let end = if index == 0 { "" } else { "\n" };
             let (name, breakdown) = (&federate.federate, self.breakdown(federate));
             match federate.declared_ns {
+                Some(declared) if !federate.waits && declared > 0 => {
+                    let declared = tenths(declared);
+                    write!(
+                        f,
+                        "{end}{name} 0 ms (declared {declared} has no effect): no input to wait for"
+                    )?;
+                }
                 None => write!(f, "{end}{name} {breakdown}")?,
                 Some(declared) => {
                     let declared = tenths(declared);
@@ -200,6 +210,9 @@ pub(crate) fn resolve(
     match stp::solve(&links, &system.declared) {
         Ok(solution) => {
             let offsets = system.offsets(wires, &solution);
+            if decentralized && system.too_long(&offsets, report) {
+                return None;
+            }
             if decentralized {
                 system.warn(&offsets, wires, report);
             }
@@ -350,6 +363,20 @@ impl System<'_> {
         missing
     }
 
+    /// Refuses what would be waited for more than an hour; whether there is such a federate.
+    fn too_long(&self, offsets: &Offsets, report: &mut Report) -> bool {
+        let long = |offset: &&FederateOffset| offset.used_ns.max(offset.decided_ns) > LONGEST_NS;
+        let first = offsets.federates.iter().find(long);
+        if let Some(offset) = first {
+            let name = &offset.federate;
+            let ms = tenths(offset.used_ns.max(offset.decided_ns));
+            let message = format!("`{name}` would wait {ms} ms: an offset is at most 1 h");
+            let fix = "declare smaller bounds";
+            report.add("F029", Place::key(&["federates", name]), message, fix);
+        }
+        first.is_some()
+    }
+
     fn refuse(&self, error: &SolveError, wires: &[Wire], report: &mut Report) {
         match error {
             SolveError::Cycle(cycle) => self.refuse_cycle(cycle, wires, report),
@@ -387,12 +414,14 @@ impl System<'_> {
         let links = self.links.iter().zip(&solution.links);
         Offsets {
             federates: federates
-                .map(|((member, offset), declared)| FederateOffset {
+                .enumerate()
+                .map(|(id, ((member, offset), declared))| FederateOffset {
                     federate: member.name.to_owned(),
                     declared_ns: *declared,
                     required_ns: offset.required_ns,
                     used_ns: offset.used_ns,
                     decided_ns: offset.decided_ns,
+                    waits: self.links.iter().any(|(_, link)| link.to.index() == id),
                     by: offset.by,
                 })
                 .collect(),
@@ -454,6 +483,13 @@ impl System<'_> {
             let Some(declared) = offset.declared_ns else {
                 continue;
             };
+            let own = member.federate.stp_offset.is_some();
+            if own && declared > 0 && !offset.waits && !member.is_foreign() {
+                let message =
+                    format!("`stp_offset` has no effect: `{name}` has no input to wait for");
+                let place = Place::key(&["federates", name, "stp_offset"]);
+                report.warn("W003", place, message, "remove it");
+            }
             // Links with an offset of their own do not use this one.
             let inherits = |link: &&LinkTerms| {
                 let wire = wires.get(link.connection);

@@ -9,10 +9,7 @@ use serde_json::Value as Json;
 use crate::document::{Key, Node, Part, Value};
 use crate::manifest::{COORDINATOR, is_name};
 use crate::problem::{Place, Report};
-use crate::{quantity, suggest};
-
-/// What people write for a time without end.
-const INFINITE: [&str; 5] = ["forever", "inf", "infinite", "infinity", "never"];
+use crate::{places, quantity, spans, suggest};
 
 /// Reports every departure of `root` from `schema`; returns what is left without them.
 pub(crate) fn prune(schema: &Json, root: &Node, report: &mut Report) -> Node {
@@ -113,7 +110,7 @@ impl<'a> Walker<'a> {
                     .into_iter()
                     .flat_map(|all| all.keys())
                     .map(String::as_str);
-                let fix = suggest::fix(&key.name, known);
+                let fix = places::fix(self.schema, &key.name, &known.collect::<Vec<_>>());
                 let message = format!("unknown key `{}`", key.name);
                 self.report
                     .add("F003", Place::new(&self.path, Part::Key), message, fix);
@@ -231,18 +228,13 @@ impl<'a> Walker<'a> {
 
     fn text(&mut self, schema: &Json, node: &Node, text: &str) -> Option<Node> {
         let (code, message, fix) = match schema.get("format").and_then(Json::as_str) {
-            Some("ictus-duration") => match quantity::duration(text) {
-                Ok(_) => return Some(node.clone()),
-                Err(error) => ("F006", error.to_string(), duration_fix(text)),
-            },
-            Some("ictus-signed-duration") => match quantity::signed_duration(text) {
-                Ok(_) => return Some(node.clone()),
-                Err(error) => ("F006", error.to_string(), duration_fix(text)),
-            },
-            Some("ictus-offset") => match offset(text) {
-                Ok(()) => return Some(node.clone()),
-                Err((message, fix)) => ("F006", message, fix),
-            },
+            Some(format @ ("ictus-duration" | "ictus-signed-duration" | "ictus-offset")) => {
+                let key = self.path.last().map_or("", String::as_str);
+                match spans::check(key, text, format) {
+                    Ok(()) => return Some(node.clone()),
+                    Err((message, fix)) => ("F006", message, fix),
+                }
+            }
             Some("ictus-address") if text.trim().parse::<SocketAddr>().is_err() => {
                 let fix = "write it as `127.0.0.1:9464`";
                 (
@@ -273,6 +265,7 @@ impl<'a> Walker<'a> {
             }
             let message = format!("unknown value `{text}`");
             let fix = match words {
+                ["count"] => "write `count`, or `{ stop_after: N }`".to_owned(),
                 [only] => format!("write `{only}`"),
                 several => suggest::fix(text, several.iter().copied()),
             };
@@ -330,11 +323,17 @@ impl<'a> Walker<'a> {
         };
         let place = Place::new(&self.path, Part::Value);
         let (code, message, fix) = match (format, number) {
-            (Some("ictus-duration" | "ictus-signed-duration" | "ictus-offset"), Some(number)) => (
-                "F006",
-                format!("`{number}` has no unit"),
-                duration_fix(&number),
-            ),
+            (
+                Some(format @ ("ictus-duration" | "ictus-signed-duration" | "ictus-offset")),
+                Some(number),
+            ) => {
+                let key = self.path.last().map_or("", String::as_str);
+                let no_unit = || (format!("`{number}` has no unit"), spans::fix(&number));
+                let (message, fix) = spans::check(key, &number, format)
+                    .err()
+                    .unwrap_or_else(no_unit);
+                ("F006", message, fix)
+            }
             (Some("ictus-size"), Some(number)) => (
                 "F006",
                 format!("`{number}` has no unit"),
@@ -384,38 +383,6 @@ fn missing_fix(name: &str) -> &'static str {
         "federation" => "name the federation: `federation: NAME`",
         _ => "",
     }
-}
-
-/// Whether a text is an offset; else what is wrong and how to mend it.
-fn offset(text: &str) -> Result<(), (String, String)> {
-    let text = text.trim();
-    if text == "auto" || quantity::duration(text).is_ok() {
-        return Ok(());
-    }
-    let fix = "write it as `5 ms`, or `auto` to have it solved from the bounds".to_owned();
-    let message = if quantity::signed_duration(text).is_ok() {
-        format!("an offset is not negative: `{text}`")
-    } else if INFINITE.contains(&text.to_lowercase().trim_start_matches('.')) {
-        format!("an offset is finite: with `{text}`, one lost message would stop everything")
-    } else {
-        match quantity::duration(text) {
-            Ok(_) => return Ok(()),
-            Err(error) => error.to_string(),
-        }
-    };
-    Err((message, fix))
-}
-
-fn duration_fix(text: &str) -> String {
-    let number: String = text
-        .trim()
-        .chars()
-        .take_while(|c| c.is_ascii_digit() || *c == '.')
-        .collect();
-    if number.is_empty() {
-        return "write it as `10 ms`; units are ns, us, ms, s, min, h".to_owned();
-    }
-    format!("write `{number} ms` or `{number} s`; units are ns, us, ms, s, min, h")
 }
 
 /// Whether a schema allows a JSON type; a schema that says nothing of types allows all.
