@@ -35,6 +35,9 @@ pub(crate) struct Verify {
     stp_offset: Option<Duration>,
 }
 
+/// The longest offset that a manifest may have.
+const LONGEST_OFFSET: Duration = Duration::from_secs(3_600);
+
 /// A way to run a federation.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, ValueEnum)]
 #[serde(rename_all = "snake_case")]
@@ -78,9 +81,13 @@ struct Run {
 
 impl Verify {
     pub(crate) fn run(&self, ui: &mut Ui) -> Result<(), CliError> {
+        if !self.modes.is_empty() {
+            self.offset_has_an_effect(&self.modes)?;
+        }
         let session = Session::new()?;
         let checked = checked(ui, &self.manifest, true)?;
         let modes = self.modes(ui, &checked)?;
+        self.offset_has_an_effect(&modes)?;
         session.block_on(async {
             let mut runs = Runs::new(&session, &checked).await?;
             let answer = self.compare(ui, &checked, (&mut runs, &modes)).await;
@@ -95,6 +102,24 @@ impl Verify {
                 answer.equal, answer.of
             )))
         })
+    }
+
+    /// Refuses `--stp-offset` when nothing runs decentralized, or when it is beyond sense.
+    fn offset_has_an_effect(&self, modes: &[Mode]) -> Result<(), CliError> {
+        let Some(offset) = self.stp_offset else {
+            return Ok(());
+        };
+        if !modes.contains(&Mode::Decentralized) {
+            let message = "`--stp-offset` has no effect: nothing runs decentralized";
+            return Err(
+                CliError::failed(message).hint("remove it, or add `decentralized` to `--modes`")
+            );
+        }
+        if offset > LONGEST_OFFSET {
+            let error = CliError::failed("`--stp-offset`: an offset is at most 1 h");
+            return Err(error.hint("write it as `200ms`"));
+        }
+        Ok(())
     }
 
     /// The modes asked for, or all that the manifest can run, the reference first.

@@ -83,6 +83,57 @@ fn mistakes_of_a_manifest() {
     );
 }
 
+/// An option that would do nothing is refused, before anything is built.
+#[test]
+fn verify_with_an_offset_that_nobody_waits() {
+    let environment = Environment::new();
+    check(
+        "verify_offset_without_effect",
+        &environment,
+        &[
+            "verify",
+            "--modes",
+            "one,centralized",
+            "--stp-offset",
+            "50ms",
+        ],
+    );
+    check(
+        "verify_offset_too_long",
+        &environment,
+        &[
+            "verify",
+            "--modes",
+            "one,decentralized",
+            "--stp-offset",
+            "2h",
+        ],
+    );
+}
+
+/// A declared offset of a federate that waits for nobody is shown with what becomes of it.
+#[test]
+fn a_plan_with_an_offset_without_effect() {
+    let environment = Environment::new();
+    fs::create_dir(environment.path("acc")).unwrap();
+    environment.write("acc/Cargo.toml", "");
+    let text = CHAIN
+        .replace("COORDINATION", "decentralized")
+        .replace("{ class: Lidar }", "{ class: Lidar, stp_offset: 3 ms }");
+    environment.write("chain.yaml", &text);
+    let said = environment.run(&["plan", "--no-build", "chain.yaml"]).ok();
+    let line = "\nlidar 0 ms (declared 3.0 has no effect): no input to wait for\n";
+    assert!(said.out.contains(line), "{said}");
+    assert!(
+        said.out.contains("\nplanner 0.9 ms = lidar offset 0 + "),
+        "{said}"
+    );
+    assert!(
+        said.err.contains("`lidar` has no input to wait for [W003]"),
+        "{said}"
+    );
+}
+
 const CHAIN: &str = "\
 ictus: v1
 federation: chain

@@ -33,6 +33,8 @@ fn value(page: &Page, federate: &str, name: &str) -> f64 {
 fn metrics_tell_what_happened_until_down() {
     let environment = Environment::new();
     assert_eq!(environment.run(&["metrics"]).ok().out, "");
+    let none = environment.run(&["metrics", "-o", "json"]).ok();
+    assert_eq!(none.out.trim(), "[]");
     environment.write("pair.yaml", PAIR);
     environment.run(&["up", "--attach", "pair.yaml"]).ok();
     let page_of_run = page(&environment);
@@ -57,6 +59,12 @@ fn metrics_tell_what_happened_until_down() {
     }
     assert!(of("sink", "ictus_rti_grant_wait_seconds_count") >= 1.0);
     assert!(of("source", "ictus_message_launch_lag_seconds_count") >= 30.0);
+    let json = environment.run(&["metrics", "-o", "json"]).ok();
+    let lines: Vec<Value> = serde_json::from_str(&json.out).unwrap();
+    let up = lines.iter().find(|line| {
+        line["name"] == "ictus_federate_exits_total" && line["labels"]["federate"] == "sink"
+    });
+    assert_eq!(up.unwrap()["value"], 1.0, "{json}");
     let ps = environment.run(&["ps", "-o", "json"]).ok();
     let view: Value = serde_json::from_str(&ps.out).unwrap();
     assert!(view[0]["metrics"].is_string(), "{ps}");
