@@ -7,6 +7,10 @@ use crate::supervisor::protocol::StopSignal;
 
 /// The RTI or a federate.
 #[derive(Debug)]
+#[expect(
+    clippy::struct_excessive_bools,
+    reason = "facts that are independent of each other"
+)]
 pub(super) struct Member {
     pub(super) name: String,
     pub(super) ours: bool,
