@@ -436,6 +436,46 @@ fn a_cut_that_nobody_explains_ends_the_federate() {
 }
 
 #[test]
+fn a_receiver_that_takes_nothing_is_left_behind_or_ends_the_sender() {
+    for on_failure in ["continue", "stop-federation"] {
+        let text = format!(
+            r#"{{"ictus": "v1", "federation": "f", "coordination": "decentralized", "extensions": true,
+                "federates": [{{"name": "me", "class": "A", "program": "p"}},
+                    {{"name": "deaf", "class": "A", "program": "p", "on_failure": "{on_failure}"}}],
+                "connections": [{{"from": {{"federate": 0, "port": "out"}}, "to": {{"federate": 1, "port": "in"}},
+                    "serializer": "native", "port_id": 0}}]}}"#
+        );
+        let plan: Plan = serde_json::from_str(&text).unwrap();
+        let mut builder = ProgramBuilder::new();
+        let me = builder.reactor("me");
+        let out = builder.port(me, "out", PortKind::Output);
+        builder.network_output(out);
+        let mut link = LinkConfig::from_plan(&plan, 0, &[], &[0]);
+        link.federation = "test".to_owned();
+        let program = Arc::new(builder.build().unwrap());
+        let mut world = World {
+            federate: Federate::federated(program, FederateConfig::default(), link),
+            notes: Notes::default(),
+            now: PhysicalTime::from_nanos(START),
+        };
+        world.federate.connect();
+        world.rti(&ToFederate::Ack);
+        let address = [127, 0, 0, 1];
+        world.rti(&ToFederate::AddressQueryReply { port: 9, address });
+        let stream = world.federate.peer_connected(1);
+        let mut ack = Vec::new();
+        FromPeer::Ack.encode(&mut ack);
+        let (now, federate) = (world.now, &mut world.federate);
+        federate.receive_from_peer(now, stream, &ack, &mut world.notes);
+        federate.peer_stuck(stream);
+        match (on_failure, world.federate.outcome()) {
+            ("continue", None) | (_, Some(Outcome::PeerStuck(1))) => {}
+            (_, outcome) => panic!("{on_failure}: {outcome:?}"),
+        }
+    }
+}
+
+#[test]
 fn a_goodbye_and_a_sender_that_may_be_outlived_explain_themselves() {
     for on_failure in ["stop-federation", "continue"] {
         let mut world = World::new(&plan(on_failure, ""));
