@@ -366,13 +366,11 @@ fn timing_shows_declared_and_measured_bounds_of_a_decentralized_run() {
     let suggested = environment.run(&["timing", "--suggest"]).ok().out;
     let (pair, _) = BOUNDS.split_once("bounds").unwrap();
     environment.write("suggested.yaml", &format!("{PAIR}{pair}{suggested}"));
-    let checked = environment.run(&["check", "--no-build", "suggested.yaml"]);
+    // What was not measured is as declared, and says so.
     assert!(
-        checked.err.contains("has no `clock_error`"),
-        "only the clock was not measured: {checked}"
+        suggested.contains("# declared, not measured"),
+        "{suggested}"
     );
-    let text = suggested.replace("# clock_error: not measured", "clock_error: 0 s");
-    environment.write("suggested.yaml", &format!("{PAIR}{pair}{text}"));
     environment
         .run(&["check", "--no-build", "suggested.yaml"])
         .ok();

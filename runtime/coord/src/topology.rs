@@ -128,21 +128,6 @@ impl Topology {
         )
     }
 
-    /// The topology of a plan.
-    #[must_use]
-    pub fn from_plan(plan: &Plan) -> Self {
-        Self::new(
-            plan.federates.len(),
-            plan.connections.iter().map(|connection| {
-                (
-                    FederateId(connection.from.federate),
-                    FederateId(connection.to.federate),
-                    connection_delay(connection),
-                )
-            }),
-        )
-    }
-
     /// The number of federates.
     #[must_use]
     pub fn len(&self) -> usize {

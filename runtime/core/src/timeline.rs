@@ -442,7 +442,8 @@ impl Timeline {
     pub fn due(&self, input: InputId, tag: Tag) -> Tag {
         let last = self.state.inputs[input.index()].last;
         let delayed = self.program.inputs[input.index()].delayed;
-        if tag <= last && (delayed || tag.time == last.time) {
+        let twice = tag.time == last.time && tag > self.state.at;
+        if tag <= last && (delayed || twice) {
             last.next_microstep().unwrap_or(Tag::FOREVER)
         } else {
             tag
