@@ -64,11 +64,12 @@ fn what_comes_too_late_is_handled_and_counted_at_an_offset_of_zero() {
     let view = sandbox.ended("late");
     assert_eq!(view["outcome"]["outcome"], "completed", "{view}");
     let (heard, tardy) = heard(&sandbox, "late");
-    // 51 ticks; what comes after the ear's last tag is counted but cannot be handled any more.
-    assert!(tardy >= 40, "{heard} in time, {tardy} tardy");
+    // 51 ticks, and each is either heard in time or counted. How many are late is up to the host; what comes after the
+    // ear's last tag is counted but cannot be handled any more.
     let counted = violations(&sandbox, "late", "ear");
+    assert_eq!(heard + counted, 51, "{heard} in time, {counted} counted");
     assert!(
-        (tardy..=tardy + 1).contains(&counted),
+        (1..=counted).contains(&tardy),
         "{tardy} tardy, {counted} counted"
     );
 }
@@ -76,7 +77,7 @@ fn what_comes_too_late_is_handled_and_counted_at_an_offset_of_zero() {
 #[test]
 fn an_offset_that_is_large_enough_lets_nothing_be_late() {
     let sandbox = Sandbox::new();
-    let head = "coordination: decentralized\ntimeout: 1 s\ndefaults: { stp_offset: 2 s }";
+    let head = "coordination: decentralized\ntimeout: 1 s\ndefaults: { stp_offset: 5 s }";
     let file = manifest(&sandbox, "early", head, BEAT);
     sandbox.ok(&["up", &file]);
     sandbox.ended("early");
@@ -116,10 +117,10 @@ fn a_federate_that_may_be_outlived_stops_nobody() {
     for coordination in ["centralized", "decentralized"] {
         let sandbox = Sandbox::new();
         let head = format!(
-            "coordination: {coordination}\ntimeout: 4 s\ndefaults: {{ stp_offset: 100 ms, on_failure: continue, stop_grace: 1 s }}"
+            "coordination: {coordination}\ntimeout: 4 s\ndefaults: {{ stp_offset: 5 s, on_failure: continue, stop_grace: 1 s }}"
         );
         let head = if coordination == "centralized" {
-            head.replace("stp_offset: 100 ms, ", "")
+            head.replace("stp_offset: 5 s, ", "")
         } else {
             head
         };
@@ -223,7 +224,7 @@ connections:
 fn lf_0_13_layouts_authentication_and_continuous_clocks_go_together() {
     let sandbox = Sandbox::new();
     let head = "coordination: decentralized\ntimeout: 1 s\nwire: \"0.13\"\nauthentication: true
-clock: { sync: on, max_error: 100 ms }\ndefaults: { stp_offset: 1 s }";
+clock: { sync: on, max_error: 100 ms }\ndefaults: { stp_offset: 5 s }";
     let file = manifest(&sandbox, "proven", head, BEAT);
     sandbox.ok(&["up", &file]);
     let view = sandbox.ended("proven");

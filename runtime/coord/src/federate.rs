@@ -245,8 +245,6 @@ pub struct Counters {
     pub skipped_announcements: u64,
     /// Tags that had to wait because downstreams were too far behind.
     pub held_back: u64,
-    /// Messages that came after their input had been decided at their tag.
-    pub stp_violations: u64,
     /// Connections of strangers that were refused.
     pub refused: u64,
 }

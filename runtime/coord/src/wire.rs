@@ -380,6 +380,12 @@ pub fn encode_tagged_message(
         payload: &[],
     })
     .encode(out);
+    write_payload(start, out, payload);
+}
+
+/// Appends the payload to the head of a message that begins at `start`, and puts its length there.
+#[inline]
+fn write_payload(start: usize, out: &mut Vec<u8>, payload: impl FnOnce(&mut Vec<u8>)) {
     let body = out.len();
     payload(out);
     let length = u32::try_from(out.len() - body).expect("payloads are shorter than 4 GiB");

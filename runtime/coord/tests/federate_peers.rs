@@ -64,10 +64,15 @@ struct World {
 
 impl World {
     fn new(plan: &Plan) -> Self {
-        Self::with(plan, None)
+        Self::with(plan, None, true)
     }
 
-    fn with(plan: &Plan, data_address: Option<[u8; 4]>) -> Self {
+    /// One that ends when nothing can come any more.
+    fn ending(plan: &Plan) -> Self {
+        Self::with(plan, None, false)
+    }
+
+    fn with(plan: &Plan, data_address: Option<[u8; 4]>, keepalive: bool) -> Self {
         let mut builder = ProgramBuilder::new();
         let me = builder.reactor("me");
         let a = builder.port(me, "a", PortKind::Input);
@@ -79,7 +84,7 @@ impl World {
         link.federation = "test".to_owned();
         link.data_address = data_address;
         let config = FederateConfig {
-            keepalive: true,
+            keepalive,
             ..FederateConfig::default()
         };
         let mut world = Self {
@@ -243,7 +248,7 @@ fn the_start_tag_obeys_the_offset_and_a_message_in_time_ends_the_wait() {
     world.says(sender, &message(0, 0, 0));
     world.at(3);
     assert_eq!(world.federate.timeline().current(), None);
-    assert_eq!(world.federate.counters().stp_violations, 0);
+    assert_eq!(world.federate.measures().stp_violations(), 0);
 }
 
 #[test]
@@ -255,7 +260,7 @@ fn a_message_after_its_time_is_tardy_and_counted_with_its_lateness() {
     world.says(sender, &message(0, 0, 0));
     let notes = vec![(tag(0), tag(0).successor())];
     assert_eq!(world.notes.tardy, notes);
-    assert_eq!(world.federate.counters().stp_violations, 1);
+    assert_eq!(world.federate.measures().stp_violations(), 1);
     let (_, upstream) = world.federate.measures().upstreams().next().unwrap();
     assert_eq!(upstream.lateness.max(), Duration::from_millis(1));
     assert_eq!(
@@ -266,7 +271,7 @@ fn a_message_after_its_time_is_tardy_and_counted_with_its_lateness() {
     world.says(sender, &message(0, 0, 8));
     let (_, upstream) = world.federate.measures().upstreams().next().unwrap();
     assert_eq!(upstream.slack.max(), Duration::from_millis(7));
-    assert_eq!(world.federate.counters().stp_violations, 1);
+    assert_eq!(world.federate.measures().stp_violations(), 1);
 }
 
 #[test]
@@ -275,7 +280,7 @@ fn a_tag_before_the_start_is_a_counted_violation() {
     let sender = world.meets(1);
     world.start();
     world.says(sender, &message(0, 0, -10));
-    assert_eq!(world.federate.counters().stp_violations, 1);
+    assert_eq!(world.federate.measures().stp_violations(), 1);
     assert!(world.federate.outcome().is_none());
 }
 
@@ -363,7 +368,7 @@ fn a_burst_of_tardy_messages_is_taken_at_once() {
     let (now, federate) = (world.now, &mut world.federate);
     let used = federate.receive_from_peer(now, sender, &bytes, &mut world.notes);
     assert_eq!(used, bytes.len());
-    assert_eq!(world.federate.counters().stp_violations, 30_000);
+    assert_eq!(world.federate.measures().stp_violations(), 30_000);
     // Each at a microstep of its own, in order.
     let actual = world.notes.tardy.iter().map(|(_, actual)| *actual);
     assert!(actual.is_sorted_by(|a, b| a < b));
@@ -422,6 +427,22 @@ fn a_physical_connection_takes_its_tag_from_the_receivers_clock() {
     });
     world.says(sender, &message);
     assert_eq!(world.federate.timeline().next_tag(), tag(20));
+    let from_2 = world.federate.measures().upstreams().find(|u| u.0 == 2);
+    assert_eq!(from_2.unwrap().1.messages, 1, "counted like any other");
+}
+
+#[test]
+fn a_program_fed_by_a_physical_connection_starves_once_its_senders_are_gone() {
+    let mut world = World::ending(&plan("continue", ""));
+    let (logical, physical) = (world.meets(1), world.meets(2));
+    world.start();
+    world.at(20);
+    world.federate.peer_closed(world.now, logical, false);
+    assert!(matches!(world.at(30), Poll::Wait(_)));
+    assert!(!world.federate.resigned(), "a message may still come");
+    world.federate.peer_closed(world.now, physical, false);
+    world.at(40);
+    assert!(world.federate.resigned());
 }
 
 #[test]
@@ -504,7 +525,7 @@ fn a_data_address_of_its_own_is_told_to_our_rti_only() {
     ] {
         let mut plan = plan("stop-federation", "");
         plan.extensions = extensions;
-        let mut world = World::with(&plan, Some([10, 1, 2, 3]));
+        let mut world = World::with(&plan, Some([10, 1, 2, 3]), true);
         let bytes = std::mem::take(world.federate.output().unwrap());
         let (mut said, mut rest) = (Vec::new(), &bytes[..]);
         while let Some((message, length)) = ToRti::decode(rest).unwrap() {

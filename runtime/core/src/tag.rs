@@ -37,6 +37,15 @@ impl Delay {
             _ => Self::Time(duration),
         }
     }
+
+    /// How much time it adds: none but for [`Delay::Time`].
+    #[must_use]
+    pub const fn span(self) -> Duration {
+        match self {
+            Self::None | Self::Microstep => Duration::ZERO,
+            Self::Time(duration) => duration,
+        }
+    }
 }
 
 impl Tag {

@@ -1,7 +1,7 @@
 //! The sockets between this federate and others: a listener while others are missing, and a connection each.
 
-use crate::bodies::Bodies;
 use crate::transport::{Awaited, Connection};
+use ictus_coord::FederateExecutor;
 use ictus_coord::federate::{Federate, PeerStream};
 use ictus_core::{Duration, PhysicalTime, Tag};
 use std::collections::BTreeSet;
@@ -101,7 +101,7 @@ impl Peers {
         &mut self,
         now: PhysicalTime,
         federate: &mut Federate,
-        bodies: &mut Bodies,
+        executor: &mut impl FederateExecutor,
     ) -> bool {
         self.accept(federate);
         let started = federate.timeline().start_tag() != Tag::NEVER;
@@ -113,7 +113,7 @@ impl Peers {
             if !connection.closed() && !full {
                 drained &= connection.read();
             }
-            let used = federate.receive_from_peer(now, peer.stream, connection.bytes(), bodies);
+            let used = federate.receive_from_peer(now, peer.stream, connection.bytes(), executor);
             connection.take(used);
             // What came before the start tag is known waits in the buffer.
             let offered = connection.bytes().is_empty() || started;
@@ -216,5 +216,187 @@ impl Peers {
         connections
             .chain(self.listener.as_ref().map(Awaited::Listener))
             .collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use ictus_coord::PayloadError;
+    use ictus_coord::federate::{FederateConfig, FederateEvent, LinkConfig, Outcome};
+    use ictus_coord::plan::{Plan, Wire};
+    use ictus_coord::wire::{FromPeer, ToFederate, ToPeer, ToRti};
+    use ictus_core::{
+        ActionId, Effects, Executor, InputId, NodeId, OutputId, PortKind, ProgramBuilder, SlotId,
+        ValueId,
+    };
+    use std::io::{Read, Write};
+    use std::net::TcpStream;
+    use std::sync::Arc;
+
+    struct Nothing;
+
+    impl Executor for Nothing {
+        fn begin(&mut self, _: Tag) {}
+        fn arrive(&mut self, _: ActionId, _: Option<SlotId>, _: ValueId) {}
+        fn run(&mut self, _: NodeId, _: Tag, _: &mut Effects) {}
+    }
+
+    impl FederateExecutor for Nothing {
+        fn encode(&mut self, _: OutputId, _: &mut Vec<u8>) {}
+        fn decode(&mut self, _: InputId, _: &[u8]) -> Result<ValueId, PayloadError> {
+            Ok(ValueId::NONE)
+        }
+    }
+
+    const NOW: PhysicalTime = PhysicalTime::from_nanos(1_000_000_000);
+
+    /// Federate 0 of two, which receives from the other (`receives`) or sends to it, and has been accepted by the RTI.
+    fn federate(receives: bool) -> Federate {
+        let (from, to) = if receives { (1, 0) } else { (0, 1) };
+        let plan = format!(
+            r#"{{"ictus": "v1", "federation": "f", "coordination": "decentralized", "extensions": true,
+                "federates": [{{"name": "me", "class": "A", "program": "p"}}, {{"name": "b", "class": "A", "program": "p"}}],
+                "connections": [{{"from": {{"federate": {from}, "port": "o"}}, "to": {{"federate": {to}, "port": "i"}},
+                    "serializer": "native", "port_id": 0}}]}}"#
+        );
+        let plan: Plan = serde_json::from_str(&plan).unwrap();
+        let mut builder = ProgramBuilder::new();
+        let me = builder.reactor("me");
+        let (inputs, outputs): (&[usize], &[usize]) = if receives {
+            let port = builder.port(me, "i", PortKind::Input);
+            builder.network_input(port, false);
+            (&[0], &[])
+        } else {
+            let port = builder.port(me, "o", PortKind::Output);
+            builder.network_output(port);
+            (&[], &[0])
+        };
+        let mut link = LinkConfig::from_plan(&plan, 0, inputs, outputs);
+        link.federation = "test".to_owned();
+        let program = Arc::new(builder.build().unwrap());
+        let mut federate = Federate::federated(program, FederateConfig::default(), link);
+        federate.connect();
+        hear(&mut federate, &ToFederate::Ack);
+        federate
+    }
+
+    fn hear(federate: &mut Federate, message: &ToFederate<'_>) {
+        let mut bytes = Vec::new();
+        message.encode(&mut bytes);
+        federate.receive(NOW, &bytes, &mut Nothing);
+        // What is to be done follows when it is polled.
+        let _ = federate.poll(NOW, &mut Nothing);
+    }
+
+    fn has_proposed(federate: &mut Federate) -> bool {
+        let _ = federate.poll(NOW, &mut Nothing);
+        let mut rest = &federate.output().unwrap()[..];
+        while let Some((message, length)) = ToRti::decode(rest).unwrap() {
+            if matches!(message, ToRti::Timestamp(_)) {
+                return true;
+            }
+            rest = &rest[length..];
+        }
+        false
+    }
+
+    fn here() -> IpAddr {
+        IpAddr::V4(Ipv4Addr::LOCALHOST)
+    }
+
+    fn look(peers: &mut Peers, federate: &mut Federate) {
+        peers.read(NOW, federate, &mut Nothing);
+        peers.write(NOW, federate);
+        peers.tidy(federate);
+    }
+
+    #[test]
+    fn strangers_are_few_and_the_refused_are_dropped() {
+        let (mut peers, mut federate) = (Peers::default(), federate(true));
+        peers.listen(here(), &mut federate).unwrap();
+        let address = peers.listener.as_ref().unwrap().local_addr().unwrap();
+        let silent: Vec<_> = (0..3 * STRANGERS_MAX)
+            .map(|_| TcpStream::connect(address).unwrap())
+            .collect();
+        look(&mut peers, &mut federate);
+        assert_eq!(peers.connections.len(), STRANGERS_MAX);
+        drop(silent);
+        for _ in 0..100 {
+            let mut rude = TcpStream::connect(address).unwrap();
+            rude.write_all(b"GET / HTTP/1.1\r\n\r\n").unwrap();
+            let refused = federate.counters().refused;
+            while federate.counters().refused == refused {
+                look(&mut peers, &mut federate);
+            }
+        }
+        assert!(peers.connections.len() <= STRANGERS_MAX);
+        // Who is awaited is let in all the same, and then nobody else.
+        let mut sender = TcpStream::connect(address).unwrap();
+        let (mut bytes, mut answer) = (Vec::new(), [0]);
+        let hello = ToPeer::Hello {
+            federate: 1,
+            federation: b"test",
+            transient: false,
+        };
+        hello.encode(Wire::V0_12, &mut bytes);
+        sender.write_all(&bytes).unwrap();
+        while federate.peers_missing() {
+            look(&mut peers, &mut federate);
+        }
+        look(&mut peers, &mut federate);
+        sender.read_exact(&mut answer).unwrap();
+        assert_eq!(FromPeer::decode(&answer), Ok(Some((FromPeer::Ack, 1))));
+        assert!(peers.listener.is_none());
+        assert_eq!(peers.connections.len(), 1);
+    }
+
+    #[test]
+    fn a_receiver_that_takes_nothing_is_given_up_and_one_that_is_slow_is_not() {
+        let (mut peers, mut federate) = (Peers::default(), federate(false));
+        let listener = TcpListener::bind((here(), 0)).unwrap();
+        let port = listener.local_addr().unwrap().port();
+        hear(
+            &mut federate,
+            &ToFederate::AddressQueryReply {
+                port: i32::from(port),
+                address: [127, 0, 0, 1],
+            },
+        );
+        let events = std::iter::from_fn(|| federate.poll_event());
+        let asked = events.last().unwrap();
+        let FederateEvent::Connect { address, port, .. } = asked else {
+            panic!("{asked:?}");
+        };
+        assert_eq!(peers.connect(&mut federate, NOW, 1, (address, port)), None);
+        let (mut receiver, _) = listener.accept().unwrap();
+        let mut ack = Vec::new();
+        FromPeer::Ack.encode(&mut ack);
+        receiver.write_all(&ack).unwrap();
+        let stream = peers.connections[0].stream;
+        // It has met everybody when it proposes a start time.
+        while !has_proposed(&mut federate) {
+            look(&mut peers, &mut federate);
+        }
+        federate.peer_output(stream).resize(64 << 20, 0);
+        let later = |seconds| NOW + Duration::from_secs(seconds);
+        peers.write(later(0), &mut federate);
+        peers.write(later(1), &mut federate);
+        // Something is taken: the time begins anew.
+        let waiting = peers.backlog(&mut federate);
+        let mut taken = vec![0; 8 << 20];
+        while peers.backlog(&mut federate) == waiting {
+            receiver.read_exact(&mut taken[..64 << 10]).unwrap();
+            peers.write(later(9), &mut federate);
+        }
+        peers.write(later(9), &mut federate);
+        peers.give_up(later(15), &mut federate);
+        assert!(federate.outcome().is_none());
+        peers.give_up(later(20), &mut federate);
+        let outcome = federate.outcome();
+        assert!(
+            matches!(outcome, Some(Outcome::PeerStuck(1))),
+            "{outcome:?}"
+        );
     }
 }

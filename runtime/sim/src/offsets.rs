@@ -1,4 +1,4 @@
-//! STP offsets for simulated federations, solved the slow way: an oracle for the solver, and bounds that hold mostly.
+//! STP offsets for simulated federations, solved the slow way (which is how the solver is checked), from bounds that hold mostly.
 
 use crate::seed::Rng;
 use crate::swarm::{Offsets, Swarm};
@@ -66,5 +66,48 @@ fn draw(plan: &mut Plan, rng: &mut Rng) {
             .percent(50)
             .then(|| *rng.pick(&[0, 500_000, 5_000_000, 30_000_000]));
         c.absent_after_ns = *rng.pick(&[0, 0, 1_000_000]);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::program::Federation;
+    use ictus_coord::stp::{Link, SolveError, solve};
+
+    #[test]
+    fn the_solver_finds_what_relaxation_finds() {
+        let (mut solved, mut refused) = (0, 0);
+        for seed in 1..=400 {
+            let mut rng = Rng::new(seed);
+            let swarm = Swarm::draw_decentralized(&mut rng);
+            let plan = Federation::generate(&swarm, &mut rng).plan();
+            let mut relaxed = plan.clone();
+            decentralize(&mut relaxed, &swarm, Offsets::Solved, &mut rng);
+            let mut links: Vec<Link> = plan.connections.iter().filter_map(Link::of).collect();
+            for link in &mut links {
+                link.bounds = Some(bounds(&swarm));
+            }
+            let solution = solve(&links, &vec![None; plan.federates.len()]);
+            let positive = relaxed.connections.iter().any(|c| c.bounds.is_none());
+            match solution {
+                Ok(solution) => {
+                    assert!(!positive, "seed {seed}");
+                    let ours = relaxed.federates.iter().map(|f| f.stp_offset_ns);
+                    let theirs = solution.federates.iter().map(|f| f.used_ns);
+                    assert!(ours.eq(theirs), "seed {seed}");
+                    solved += 1;
+                }
+                Err(SolveError::Cycle(_)) => {
+                    assert!(positive, "seed {seed}");
+                    refused += 1;
+                }
+                Err(error) => panic!("seed {seed}: {error}"),
+            }
+        }
+        assert!(
+            solved > 20 && refused > 20,
+            "{solved} solved, {refused} refused"
+        );
     }
 }

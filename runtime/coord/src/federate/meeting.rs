@@ -321,6 +321,10 @@ impl Federate {
         executor: &mut impl FederateExecutor,
     ) -> Result<(), Outcome> {
         self.counters.received += 1;
+        if let Some(link) = &self.link {
+            let sender = link.config.inputs[input.index()].federate;
+            self.measures.arrived(sender, payload.len());
+        }
         if self.stop.over(self.timeline.at()) {
             return Ok(());
         }

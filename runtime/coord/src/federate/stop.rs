@@ -210,7 +210,9 @@ impl Federate {
         let stays = abandoned.is_none();
         let reached = match lost {
             Some(lost) => Outcome::PeerLost(lost),
-            None if self.stop.violated => Outcome::TooManyViolations(self.counters.stp_violations),
+            None if self.stop.violated => {
+                Outcome::TooManyViolations(self.measures.stp_violations())
+            }
             None => Outcome::Stopped,
         };
         self.outcome = Some(abandoned.unwrap_or(reached));

@@ -123,26 +123,18 @@ impl Federate {
         if self.stop.over(self.timeline.at()) {
             return Ok(());
         }
-        let late = || now.since(message.tag.time.as_physical()) - input.stp_offset;
+        let time = message.tag.time.as_physical();
+        let by = time.saturating_add(input.stp_offset);
         if self.timeline.finished() {
             if self.timeline.due(message.input, message.tag) <= self.timeline.at() {
-                self.count_violation(message.input, late());
+                self.count_violation(message.input, now.since(by));
                 let after = self.timeline.at().successor();
                 executor.note_tardy(message.input, message.tag, after);
             }
             return Ok(());
         }
         let value = executor.decode(message.input, message.payload)?;
-        let by = message
-            .tag
-            .time
-            .as_physical()
-            .saturating_add(input.stp_offset);
-        let origin = message
-            .tag
-            .time
-            .as_physical()
-            .saturating_add(-delay(input.delay));
+        let origin = time.saturating_add(-input.delay.span());
         let arrival = now.since(origin.saturating_add(input.sender_offset));
         self.measures.arrival(input.federate, arrival);
         match self.timeline.admit(message.input, message.tag, value) {
@@ -157,7 +149,7 @@ impl Federate {
                 executor.arrive(action, program.action_slot(action), value);
             }
             Admission::Tardy { intended, actual } => {
-                self.count_violation(message.input, late());
+                self.count_violation(message.input, now.since(by));
                 executor.note_tardy(message.input, intended, actual);
                 return Ok(());
             }
@@ -173,7 +165,6 @@ impl Federate {
         }
         let upstream = link.config.inputs[input.index()].federate;
         let limit = link.config.max_stp_violations;
-        self.counters.stp_violations += 1;
         if let Some(count) = self.measures.violation(upstream, lateness) {
             self.events.push_back(FederateEvent::StpViolation {
                 upstream,
@@ -181,16 +172,9 @@ impl Federate {
                 count,
             });
         }
-        if limit == Some(self.counters.stp_violations) {
+        if limit == Some(self.measures.stp_violations()) {
             self.stop.too_many_violations();
             self.request_stop_at_current();
         }
-    }
-}
-
-fn delay(delay: ictus_core::Delay) -> Duration {
-    match delay {
-        ictus_core::Delay::Time(delay) => delay,
-        ictus_core::Delay::None | ictus_core::Delay::Microstep => Duration::ZERO,
     }
 }

@@ -194,10 +194,7 @@ pub fn encode_peer_message(
             payload: &[],
         }),
     }
-    let body = out.len();
-    payload(out);
-    let length = u32::try_from(out.len() - body).expect("payloads are shorter than 4 GiB");
-    out[start + 5..start + 9].copy_from_slice(&length.to_le_bytes());
+    super::write_payload(start, out, payload);
 }
 
 #[cfg(test)]

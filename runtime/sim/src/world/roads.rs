@@ -115,7 +115,7 @@ impl Laws {
         self.faithful = Some(self.faithful.map_or(tag, |earlier| earlier.min(tag)));
     }
 
-    /// Violations counted, and whether there must be none.
+    /// Whether no message may have been counted as a violation.
     pub(super) fn must_be_clean(&self) -> bool {
         self.solved && self.within_bounds && self.messages > 0
     }
@@ -127,11 +127,11 @@ impl Laws {
         };
         self.messages += 1;
         let Some(bounds) = lane.bounds else { return };
-        let after = match lane.delay {
-            Delay::Time(delay) => delay,
-            Delay::None | Delay::Microstep => Duration::ZERO,
-        };
-        let origin = message.tag.time.as_physical().saturating_add(-after);
+        let origin = message
+            .tag
+            .time
+            .as_physical()
+            .saturating_add(-lane.delay.span());
         let lag = trip.written_there.since(origin) - lane.sender_offset;
         let latency = trip.arrived - trip.written;
         let clocks = trip.arrived_here.since(trip.arrived_there).as_nanos();
@@ -269,14 +269,14 @@ impl<E: SimulatedExecutor> World<E> {
             ToPeer::PortAbsent(absent) => Some((absent.port, absent.tag)),
             ToPeer::Hello { .. } | ToPeer::Message(_) => None,
         };
-        let before = host.federate.counters().stp_violations;
+        let before = host.federate.measures().stp_violations();
         let (federate, executor) = (&mut host.federate, &mut host.executor);
         let used =
             federate.receive_from_peer(now, road.at_receiver, &road.arrived[..length], executor);
         if used == 0 {
             return false;
         }
-        let counted = host.federate.counters().stp_violations > before;
+        let counted = host.federate.measures().stp_violations() > before;
         if let Some((port, tag)) = told
             && let Some(lane) = self.laws.lanes.get_mut(&(receiver, port))
         {
