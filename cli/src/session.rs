@@ -170,6 +170,7 @@ pub(crate) fn request(checked: &Checked, trace: bool) -> StartRequest {
         settings: checked.settings.clone(),
         timing: checked.timing.clone(),
         trace,
+        part: None,
     }
 }
 

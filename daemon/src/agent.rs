@@ -192,7 +192,7 @@ impl Agent {
         }
         match state {
             State::Running => agent.was_healthy = true,
-            State::Starting => agent.undo(now, Why::Aborted),
+            State::Prepared | State::Starting => agent.undo(now, Why::Aborted),
             State::Stopping | State::Ended => {
                 agent.was_healthy = true;
                 agent.begin_stop(now, Why::Requested);

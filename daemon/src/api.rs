@@ -26,6 +26,10 @@ use serde::{Deserialize, Serialize};
 
 use crate::supervisor::exit::Ending;
 
+pub mod part;
+
+use part::Part;
+
 /// The version in every path.
 pub const VERSION: &str = "v1";
 
@@ -48,7 +52,7 @@ pub struct Info {
 pub struct StartRequest {
     /// The manifest it came from; for messages only.
     pub manifest: PathBuf,
-    /// The working directory of every federate.
+    /// The working directory of every federate; of a part, its own.
     pub cwd: PathBuf,
     /// The resolved plan.
     pub plan: Plan,
@@ -60,6 +64,9 @@ pub struct StartRequest {
     pub timing: TimingSpec,
     /// Whether federates write their logical traces.
     pub trace: bool,
+    /// Which part of it is this host's; absent: all of it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub part: Option<Part>,
 }
 
 /// A federation as it is.
@@ -90,12 +97,20 @@ pub struct FederationView {
     pub federates: Vec<MemberView>,
     /// How it ended.
     pub outcome: Option<Outcome>,
+    /// Which part of the federation this is; absent: all of it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub part: Option<Part>,
+    /// A digest of what it was prepared from, by which a later `up` knows whether anything has changed.
+    #[serde(default, skip_serializing_if = "String::is_empty")]
+    pub digest: String,
 }
 
 /// Where a federation stands in its life.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum State {
+    /// A part that waits for its commit; nothing runs.
+    Prepared,
     /// Not every federate has completed its first tag.
     Starting,
     /// Every federate has.
@@ -243,6 +258,10 @@ pub struct Failure {
     pub kind: FailureKind,
     /// `rti` or the federate; absent when it is the federation as a whole.
     pub member: Option<String>,
+    /// How likely it is a consequence of another one: 0 is a cause. Of several parts' failures the lowest and earliest
+    /// is the one to tell.
+    #[serde(default)]
+    pub rank: u8,
     /// What happened, in words.
     pub what: String,
     /// The first lines that the member wrote.
@@ -462,6 +481,8 @@ pub enum ErrorCode {
     AlreadyRunning,
     /// A federation of this name runs, from another plan.
     Conflict,
+    /// Somebody else holds the lease, or held it since: the number is not the last that was given.
+    Held,
     /// The daemon could not do its part: the disk, a process.
     Failed,
 }

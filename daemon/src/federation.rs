@@ -127,6 +127,8 @@ impl Federation {
             rti: MemberView::default(),
             federates: Vec::new(),
             outcome: None,
+            part: request.part.clone(),
+            digest: String::new(),
         };
         let record = Record {
             protocol: PROTOCOL,

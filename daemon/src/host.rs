@@ -385,6 +385,7 @@ fn unreadable_view(name: &str, directory: &Directory, error: &StoreError) -> Fed
             failure: Failure {
                 kind: FailureKind::Process,
                 member: None,
+                rank: 0,
                 what: format!("unreadable: {}", with_sources(error)),
                 lines: Vec::new(),
                 log: None,
@@ -392,6 +393,8 @@ fn unreadable_view(name: &str, directory: &Directory, error: &StoreError) -> Fed
             },
             was_healthy: true,
         }),
+        part: None,
+        digest: String::new(),
     }
 }
 

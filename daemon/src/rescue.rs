@@ -46,6 +46,8 @@ pub(crate) fn record(name: &str, directory: &Directory) -> Option<Record> {
         rti: MemberView::default(),
         federates: Vec::new(),
         outcome: None,
+        part: None,
+        digest: String::new(),
     };
     for happening in events {
         let by_user = |by: &str| by == "user" && view.state == State::Running;

@@ -446,7 +446,9 @@ impl IntoResponse for ApiError {
         let status = match self.code {
             ErrorCode::BadRequest => StatusCode::BAD_REQUEST,
             ErrorCode::Unknown => StatusCode::NOT_FOUND,
-            ErrorCode::AlreadyRunning | ErrorCode::Conflict => StatusCode::CONFLICT,
+            ErrorCode::AlreadyRunning | ErrorCode::Conflict | ErrorCode::Held => {
+                StatusCode::CONFLICT
+            }
             ErrorCode::Failed => StatusCode::INTERNAL_SERVER_ERROR,
         };
         (status, Json(self)).into_response()

@@ -12,6 +12,7 @@ use crate::document::{Node, SyntaxError, Value};
 use crate::federation::{self, Executables, Member, Origin, Workshop};
 use crate::manifest::{self, Manifest, TimeSpan};
 use crate::offsets::Offsets;
+use crate::placement::{Needs, Placement};
 use crate::problem::{Place, Problem, Problems, Report};
 use crate::timing::TimingSpec;
 use crate::{causality, lets, offsets, plan, policy, reactions, structure, wiring};
@@ -92,6 +93,8 @@ pub struct Checked {
     pub offsets: Option<Offsets>,
     /// One per federate of the plan, in its order. Empty after a check without build.
     pub federates: Vec<FederateRun>,
+    /// Which member runs on which host; absent: all on this machine, as processes.
+    pub placement: Option<Placement>,
     /// What the manifest says about the run itself.
     pub settings: Settings,
     /// What `ictus timing` prints, resolved to reactor paths and reaction indices. Empty after a check
@@ -117,6 +120,9 @@ pub struct FederateRun {
     pub kind: FederateKind,
     /// Environment variables to add.
     pub env: BTreeMap<String, String>,
+    /// What it needs from its host.
+    #[serde(default)]
+    pub needs: Needs,
 }
 
 /// Whose command line a federate's program understands.
@@ -266,6 +272,7 @@ fn conclude(
         plan: plan::resolve(manifest, members, (wires, offsets.as_ref())),
         offsets,
         federates: runs(members, executables),
+        placement: None,
         settings: settings(manifest),
         timing,
         one_program: one_program(members, executables),
@@ -347,6 +354,7 @@ fn runs(members: &[Member<'_>], executables: &Executables) -> Vec<FederateRun> {
             env: env
                 .map(|(name, value)| (name.clone(), value.to_string()))
                 .collect(),
+            needs: Needs::default(),
         })
     };
     (0_u16..).zip(members).filter_map(run).collect()

@@ -99,6 +99,7 @@ fn state(view: &FederationView) -> String {
             let who = failure.member.as_deref().unwrap_or("federation");
             format!("failed: {who}: {}", one_line(&failure.what))
         }
+        (None, State::Prepared) => "prepared".to_owned(),
         (None, State::Starting) => "starting".to_owned(),
         (None, State::Running) => "running".to_owned(),
         (None, State::Stopping) => "stopping".to_owned(),

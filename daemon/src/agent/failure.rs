@@ -29,6 +29,7 @@ impl Agent {
         Failure {
             kind: FailureKind::Process,
             member: Some(self.member(id).name.clone()),
+            rank: 0,
             what,
             lines: Vec::new(),
             log: None,
@@ -93,6 +94,7 @@ impl Agent {
                         failure: Failure {
                             kind: FailureKind::Timeout,
                             member: None,
+                            rank: 0,
                             what,
                             lines: Vec::new(),
                             log: None,

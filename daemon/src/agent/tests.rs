@@ -29,6 +29,7 @@ fn request() -> StartRequest {
         executable: PathBuf::from("/bin/program"),
         kind: FederateKind::Ours,
         env: BTreeMap::new(),
+        needs: ictus_deploy::Needs::default(),
     };
     StartRequest {
         manifest: PathBuf::from("/m/federation.yaml"),
@@ -43,6 +44,7 @@ fn request() -> StartRequest {
         settings: Settings::default(),
         timing: TimingSpec::default(),
         trace: false,
+        part: None,
     }
 }
 

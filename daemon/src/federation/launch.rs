@@ -180,6 +180,7 @@ mod tests {
             executable: "/bin/f".into(),
             kind: FederateKind::Ours,
             env: BTreeMap::new(),
+            needs: ictus_deploy::Needs::default(),
         };
         let request = StartRequest {
             manifest: "/f.yaml".into(),
@@ -189,6 +190,7 @@ mod tests {
             settings: Settings::default(),
             timing: TimingSpec::default(),
             trace: false,
+            part: None,
         };
         let args = rti_args(&request, "x");
         assert_eq!(

@@ -98,6 +98,8 @@ fn snapshot(federation: &str) -> Snapshot {
                 member("b", "running", None),
             ],
             outcome: None,
+            part: None,
+            digest: String::new(),
         },
         measures: FederationMeasures {
             federation: federation.to_owned(),

@@ -229,6 +229,7 @@ pub(crate) fn federation(members: &[(&str, &str)]) -> StartRequest {
         executable: fakes().to_path_buf(),
         kind: FederateKind::Ours,
         env: BTreeMap::from([("FAKE".to_owned(), (*manner).to_owned())]),
+        needs: ictus_deploy::Needs::default(),
     };
     StartRequest {
         manifest: PathBuf::from("/m/federation.yaml"),
@@ -246,5 +247,6 @@ pub(crate) fn federation(members: &[(&str, &str)]) -> StartRequest {
         },
         timing: TimingSpec::default(),
         trace: true,
+        part: None,
     }
 }
