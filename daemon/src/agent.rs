@@ -166,12 +166,21 @@ struct Ranked {
 }
 
 impl Agent {
-    /// Begins a start: the first action launches the RTI.
+    /// Begins a start: the first action launches the RTI, or when it runs on another host, listening on `rti_port`,
+    /// this host's federates.
     #[must_use]
-    pub fn start(now: Now, request: &StartRequest) -> Self {
+    pub fn start(now: Now, request: &StartRequest, rti_port: Option<u16>) -> Self {
         let until = now.since + request.settings.join_timeout;
         let mut agent = Self::new(request, Phase::Starting { until });
-        agent.launch(MemberId::Rti);
+        if agent.rti.here {
+            agent.launch(MemberId::Rti);
+        } else {
+            agent.rti_port = rti_port;
+            for id in agent.federate_ids() {
+                agent.launch(id);
+            }
+            agent.advance(now);
+        }
         agent
     }
 
@@ -181,10 +190,13 @@ impl Agent {
     pub fn adopt(
         now: Now,
         request: &StartRequest,
-        state: State,
+        (state, rti_port): (State, Option<u16>),
         launched: impl Fn(MemberId) -> bool,
     ) -> Self {
         let mut agent = Self::new(request, Phase::Running);
+        if !agent.rti.here {
+            agent.rti_port = rti_port;
+        }
         for id in agent.ids() {
             if launched(id) {
                 agent.member_mut(id).process = Process::Launching;
@@ -203,13 +215,18 @@ impl Agent {
 
     fn new(request: &StartRequest, phase: Phase) -> Self {
         let federates = request.federates.iter();
+        let part = request.part.as_ref();
         Self {
-            rti: Member::new(RTI, true),
+            rti: Member {
+                here: part.is_none_or(|part| part.rti),
+                ..Member::new(RTI, true)
+            },
             federates: federates
                 .map(|run| {
                     let plan = request.plan.federates.get(usize::from(run.id));
                     Member {
                         outlived: plan.is_some_and(|it| it.on_failure == OnFailure::Continue),
+                        here: part.is_none_or(|part| part.federates.contains(&run.id)),
                         ..Member::new(&run.name, run.kind == FederateKind::Ours)
                     }
                 })
@@ -387,14 +404,15 @@ impl Agent {
     /// What the federates measured.
     #[must_use]
     pub fn measures(&self) -> Vec<FederateMeasures> {
-        let federates = self.federates.iter();
+        let federates = self.federates.iter().filter(|member| member.here);
         federates.map(|member| member.measures.clone()).collect()
     }
 
-    /// How the federates are.
+    /// How the federates of this host are.
     #[must_use]
     pub fn federate_views(&self) -> Vec<MemberView> {
-        self.federates.iter().map(Member::view).collect()
+        let federates = self.federates.iter().filter(|member| member.here);
+        federates.map(Member::view).collect()
     }
 
     fn handle_started(&mut self, id: MemberId, pid: u32) {
@@ -411,7 +429,7 @@ impl Agent {
             member: name,
             pid,
             started,
-            of: self.federates.len(),
+            of: self.federates.iter().filter(|it| it.here).count(),
         });
     }
 
@@ -475,8 +493,7 @@ impl Agent {
                 },
             );
         }
-        let nothing_left = id == MemberId::Rti || !self.federates.iter().any(Member::lives);
-        if matches!(self.phase, Phase::Running) && nothing_left {
+        if matches!(self.phase, Phase::Running) && (id == MemberId::Rti || self.nothing_left()) {
             self.expect_stop(now, Why::Program);
         }
     }
@@ -505,17 +522,11 @@ impl Agent {
 
     /// Moves to the next phase when its condition holds.
     fn advance(&mut self, now: Now) {
-        if matches!(self.phase, Phase::Starting { .. })
-            && self.start_ns.is_some()
-            && self
-                .federates
-                .iter()
-                .all(|member| member.joined && (member.running || !member.ours))
-        {
+        if matches!(self.phase, Phase::Starting { .. }) && self.is_healthy() {
             self.was_healthy = true;
             self.phase = Phase::Running;
             self.tell(Event::Healthy);
-            if !self.federates.iter().any(Member::lives) {
+            if self.nothing_left() {
                 self.expect_stop(now, Why::Program);
             }
         }
@@ -534,10 +545,31 @@ impl Agent {
         }
     }
 
+    /// Whether everybody of this host runs. That all have joined is in the start tag; a foreign federate says nothing
+    /// itself, and only an RTI of the same host speaks for it.
+    fn is_healthy(&self) -> bool {
+        let heard = |member: &Member| {
+            if member.ours {
+                member.joined && member.running
+            } else {
+                member.joined || (!self.rti.here && member.process == Process::Up)
+            }
+        };
+        let mut here = self.federates.iter().filter(|member| member.here);
+        let silent = !self.rti.here && here.clone().all(|member| !member.ours);
+        (self.start_ns.is_some() || silent) && here.all(heard)
+    }
+
+    /// Whether no federate is left for which this host's members would stay.
+    fn nothing_left(&self) -> bool {
+        let some_elsewhere = self.federates.iter().any(|member| !member.here);
+        !self.federates.iter().any(Member::lives) && !(self.rti.lives() && some_elsewhere)
+    }
+
     fn launch(&mut self, member: MemberId) {
         let rti_port = self.rti_port;
         let state = self.member_mut(member);
-        if state.process == Process::Waiting {
+        if state.here && state.process == Process::Waiting {
             state.process = Process::Launching;
             self.actions.push_back(Action::Launch { member, rti_port });
         }

@@ -1,20 +1,23 @@
 //! A client of the daemon: what the command line uses.
 
 use std::ffi::OsStr;
+use std::fmt;
 use std::fs::OpenOptions;
 use std::io;
 use std::marker::PhantomData;
 use std::path::{Path, PathBuf};
+use std::pin::Pin;
 use std::process::Stdio;
+use std::sync::Arc;
 use std::time::Duration;
 
 use http_body_util::{BodyExt, Full, Limited};
-use hyper::body::{Bytes, Incoming};
+use hyper::body::{Body, Bytes, Incoming};
 use hyper::client::conn::http1;
 use hyper::{Method, Response, StatusCode};
 use hyper_util::rt::TokioIo;
 use serde::de::DeserializeOwned;
-use tokio::io::{AsyncBufReadExt, BufReader};
+use tokio::io::{AsyncBufReadExt, AsyncRead, AsyncWrite, BufReader};
 use tokio::net::UnixStream;
 use tokio::task::JoinHandle;
 use tokio::time::timeout;
@@ -40,11 +43,28 @@ const ANSWER_BYTES_MAX: usize = 64 << 20;
 /// The longest line of a stream.
 const LINE_BYTES_MAX: usize = 1 << 20;
 
-/// A way to the daemon; each request has a connection of its own.
+/// A way to a daemon; each request has a connection of its own.
 #[derive(Clone, Debug)]
 pub struct Client {
-    socket: PathBuf,
+    way: Way,
 }
+
+#[derive(Clone, Debug)]
+enum Way {
+    Socket(PathBuf),
+    Dial(Arc<dyn Dial>),
+}
+
+/// Makes connections to the daemon of another host.
+pub trait Dial: fmt::Debug + Send + Sync {
+    /// One connection, over which the daemon already answers.
+    fn dial(&self) -> Pin<Box<dyn Future<Output = io::Result<Box<dyn Duplex>>> + Send + '_>>;
+}
+
+/// Bytes in both directions.
+pub trait Duplex: AsyncRead + AsyncWrite + Send + Unpin {}
+
+impl<T: AsyncRead + AsyncWrite + Send + Unpin> Duplex for T {}
 
 /// Why a request failed.
 #[derive(Debug, thiserror::Error)]
@@ -117,13 +137,16 @@ impl Client {
         let in_lock = paths.socket_in_lock();
         let own = Some(paths.socket()).filter(|own| in_lock.as_ref() != Some(own));
         for socket in in_lock.into_iter().chain(own) {
-            let client = Self { socket };
+            let client = Self {
+                way: Way::Socket(socket.clone()),
+            };
             match timeout(PROBE_MAX, client.info()).await {
                 Ok(Ok(_)) => return Ok(Some(client)),
                 Ok(Err(silent @ ClientError::Silent { .. })) => return Err(silent),
                 Ok(Err(_)) => {}
                 Err(_) => {
-                    let pid = client.listener().await;
+                    let stream = UnixStream::connect(&socket).await.ok();
+                    let pid = stream.as_ref().and_then(listener);
                     return Err(ClientError::Silent { pid });
                 }
             }
@@ -131,10 +154,12 @@ impl Client {
         Ok(None)
     }
 
-    /// Who listens on the socket, as the system tells it.
-    async fn listener(&self) -> Option<u32> {
-        let stream = UnixStream::connect(&self.socket).await.ok()?;
-        listener(&stream)
+    /// The daemon of another host.
+    #[must_use]
+    pub fn over(dial: Arc<dyn Dial>) -> Self {
+        Self {
+            way: Way::Dial(dial),
+        }
     }
 
     /// Finds the daemon, or starts `EXECUTABLE daemon` and waits until it serves.
@@ -344,14 +369,28 @@ impl Client {
         path: &str,
         body: Bytes,
     ) -> Result<(Response<Incoming>, Connection), ClientError> {
-        let unreachable = |source| ClientError::Unreachable {
-            socket: self.socket.clone(),
-            source,
+        let limit = if method == Method::DELETE {
+            // As long as the federation takes to stop, which has bounds of its own.
+            None
+        } else {
+            Some(ANSWER_MAX)
         };
-        let stream = UnixStream::connect(&self.socket)
-            .await
-            .map_err(unreachable)?;
-        let pid = listener(&stream);
+        self.exchange((method, path), Full::new(body), limit).await
+    }
+
+    /// Sends a request with any body; the answer begins within the limit.
+    async fn exchange<B>(
+        &self,
+        (method, path): (Method, &str),
+        body: B,
+        limit: Option<Duration>,
+    ) -> Result<(Response<Incoming>, Connection), ClientError>
+    where
+        B: Body + Send + 'static,
+        B::Data: Send,
+        B::Error: Into<Box<dyn std::error::Error + Send + Sync>>,
+    {
+        let (stream, pid) = self.connect().await?;
         let io = TokioIo::new(stream);
         let (mut sender, connection) = http1::handshake(io).await.map_err(ClientError::Broken)?;
         let connection = Connection(tokio::spawn(async move {
@@ -362,17 +401,14 @@ impl Client {
             .method(method)
             .uri(path)
             .header("host", "ictusd")
-            .body(Full::new(body))
-            .map_err(|error| unreachable(io::Error::other(error)))?;
-        let removal = request.method() == Method::DELETE;
+            .body(body)
+            .map_err(|error| self.unreachable(io::Error::other(error)))?;
         let answer = sender.send_request(request);
-        let response = if removal {
-            // As long as the federation takes to stop, which has bounds of its own.
-            answer.await
-        } else {
-            timeout(ANSWER_MAX, answer)
+        let response = match limit {
+            Some(limit) => timeout(limit, answer)
                 .await
-                .map_err(|_| ClientError::Silent { pid })?
+                .map_err(|_| ClientError::Silent { pid })?,
+            None => answer.await,
         };
         let response = response.map_err(ClientError::Broken)?;
         if response.status() == StatusCode::OK {
@@ -381,6 +417,30 @@ impl Client {
         let bytes = whole(response).await?;
         let error: ApiError = serde_json::from_slice(&bytes).map_err(ClientError::NotUnderstood)?;
         Err(ClientError::Refused(error))
+    }
+
+    /// A connection, and who listens there if that is on this host.
+    async fn connect(&self) -> Result<(Box<dyn Duplex>, Option<u32>), ClientError> {
+        match &self.way {
+            Way::Socket(socket) => {
+                let stream = UnixStream::connect(socket).await;
+                let stream = stream.map_err(|error| self.unreachable(error))?;
+                let pid = listener(&stream);
+                Ok((Box::new(stream), pid))
+            }
+            Way::Dial(dial) => {
+                let stream = dial.dial().await;
+                Ok((stream.map_err(|error| self.unreachable(error))?, None))
+            }
+        }
+    }
+
+    fn unreachable(&self, source: io::Error) -> ClientError {
+        let socket = match &self.way {
+            Way::Socket(socket) => socket.clone(),
+            Way::Dial(_) => PathBuf::new(),
+        };
+        ClientError::Unreachable { socket, source }
     }
 }
 
@@ -391,6 +451,8 @@ pub fn is_already_running(error: &ClientError) -> bool {
         .refusal()
         .is_some_and(|refusal| refusal.code == ErrorCode::AlreadyRunning)
 }
+
+mod parts;
 
 /// A stream of JSON values; dropping it closes the connection.
 #[derive(Debug)]

@@ -2,7 +2,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::io;
-use std::net::SocketAddr;
+use std::net::{SocketAddr, SocketAddrV4};
 use std::time::Duration;
 
 use tokio::sync::{broadcast, mpsc, oneshot, watch};
@@ -24,6 +24,7 @@ mod launch;
 mod link;
 mod order;
 
+use launch::Run;
 use link::{Heard, Link, Origin};
 use order::Order;
 
@@ -112,17 +113,30 @@ impl Federation {
         (request, metrics): (StartRequest, Option<SocketAddr>),
         told: broadcast::Sender<Happening>,
     ) -> Result<(Self, Handle), BeginError> {
+        let id = random_id().map_err(BeginError::Random)?;
+        let (directory, mut record) = Self::prepare(paths, name, &request, id)?;
+        record.view.metrics = metrics;
+        Ok(Self::begin(paths, directory, (request, record, None), told))
+    }
+
+    /// Clears the disk for a new run and writes what it needs; nothing of it runs.
+    pub(crate) fn prepare(
+        paths: &Paths,
+        name: &str,
+        request: &StartRequest,
+        id: String,
+    ) -> Result<(Directory, Record), StoreError> {
         let directory = Directory::of(&paths.federations(), name);
-        directory.prepare(&request)?;
+        directory.prepare(request)?;
         let view = FederationView {
             name: name.to_owned(),
-            state: State::Starting,
-            id: random_id().map_err(BeginError::Random)?,
+            state: State::Prepared,
+            id,
             since_ns: stamp::now_ns(),
             manifest: request.manifest.clone(),
             directory: directory.path().to_path_buf(),
             rti_port: None,
-            metrics,
+            metrics: None,
             start_ns: None,
             rti: MemberView::default(),
             federates: Vec::new(),
@@ -133,17 +147,28 @@ impl Federation {
         let record = Record {
             protocol: PROTOCOL,
             members: BTreeMap::new(),
+            rti: None,
             view,
         };
+        Ok((directory, record))
+    }
+
+    /// Begins a run that is prepared; `rti` is where its RTI listens, when that is another host.
+    pub(crate) fn begin(
+        paths: &Paths,
+        directory: Directory,
+        (request, mut record, rti): (StartRequest, Record, Option<SocketAddrV4>),
+        told: broadcast::Sender<Happening>,
+    ) -> (Self, Handle) {
+        record.view.state = State::Starting;
+        record.rti = rti;
+        if let Some(rti) = rti {
+            record.view.rti_port = Some(rti.port());
+        }
         let origin = Instant::now();
-        let agent = Agent::start(now(origin), &request);
-        Ok(Self::new(
-            paths.clone(),
-            directory,
-            request,
-            (agent, record, origin),
-            told,
-        ))
+        let agent = Agent::start(now(origin), &request, rti.map(|rti| rti.port()));
+        let state = (agent, record, origin);
+        Self::new(paths.clone(), directory, request, state, told)
     }
 
     /// Takes over a run that another daemon began.
@@ -156,7 +181,8 @@ impl Federation {
         let request = directory.read_request()?;
         let origin = Instant::now();
         let launched = |id| record.members.contains_key(member_name(&request, id));
-        let agent = Agent::adopt(now(origin), &request, record.view.state, launched);
+        let known = (record.view.state, record.view.rti_port);
+        let agent = Agent::adopt(now(origin), &request, known, launched);
         let state = (agent, record, origin);
         let (mut federation, handle) = Self::new(paths.clone(), directory, request, state, told);
         let kept = federation.directory.events_kept();
@@ -332,13 +358,13 @@ impl Federation {
         }
         self.update(!ready.is_empty());
         for (member, name, rti_port, supervised) in ready {
-            let spec = launch::spec(
-                &self.directory,
-                &self.request,
-                &self.record.view.id,
-                (member, rti_port),
-                &supervised,
-            );
+            let run = Run {
+                paths: &self.paths,
+                directory: &self.directory,
+                request: &self.request,
+                record: &self.record,
+            };
+            let spec = launch::spec(&run, (member, rti_port), &supervised);
             self.link(member, &name, &supervised, Origin::Launch(Box::new(spec)));
         }
     }

@@ -14,11 +14,14 @@ use crate::api::{
     FederationView, Happening, MemberView, Outcome, Removed, StartRequest, State,
 };
 use crate::federation::{BeginError, Command, Federation, Handle};
+use crate::leases::Leases;
 use crate::metrics::{self, Snapshot};
 use crate::paths::Paths;
 use crate::scrape::Listeners;
 use crate::store::{self, Directory, Record, StoreError};
 use crate::{rescue, stamp};
+
+mod parts;
 
 /// Events that a slow follower may miss before it is disconnected.
 const EVENTS_MAX: usize = 4096;
@@ -33,6 +36,9 @@ struct Inner {
     living: Mutex<BTreeMap<String, Handle>>,
     /// Where metrics are served over TCP.
     listeners: Mutex<Listeners>,
+    leases: Mutex<Leases>,
+    /// The origin of the leases' time.
+    origin: Instant,
     told: broadcast::Sender<Happening>,
     /// When something was last asked or owned.
     active: watch::Sender<Instant>,
@@ -45,6 +51,8 @@ impl Host {
             paths,
             living: Mutex::default(),
             listeners: Mutex::default(),
+            leases: Mutex::default(),
+            origin: Instant::now(),
             told: broadcast::channel(EVENTS_MAX).0,
             active: watch::channel(Instant::now()).0,
             end: watch::channel(false).0,
@@ -57,10 +65,14 @@ impl Host {
 
     /// Takes over every run that an earlier daemon left; returns when the members of each were looked at.
     pub(crate) async fn adopt_all(&self) {
+        self.restore_leases();
         let mut adopted = Vec::new();
         for name in store::names(&self.0.paths.federations()) {
             let directory = self.directory(&name);
             match recorded(&name, &directory) {
+                Ok(Some(record)) if record.view.state == State::Prepared => {
+                    tracing::info!(%name, run = record.view.id, "prepared, and not committed");
+                }
                 Ok(Some(mut record)) if record.view.outcome.is_none() => {
                     record.view.metrics = self.listen_again(&name, &directory);
                     let told = self.0.told.clone();
@@ -85,6 +97,7 @@ impl Host {
     /// Begins a federation; every later event of it reaches `subscribe`d receivers.
     pub(crate) fn start(&self, name: &str, request: StartRequest) -> Result<Handle, ApiError> {
         validate(name, &request)?;
+        self.check_fence(name, None)?;
         if let Some(living) = self.living().get(name) {
             let same = living.request == request;
             let code = if same {
@@ -212,7 +225,12 @@ impl Host {
     }
 
     /// Stops a federation if it lives, waits for its end, and removes what it left.
-    pub(crate) async fn remove(&self, name: &str, purge: bool) -> Result<Removed, ApiError> {
+    pub(crate) async fn remove(
+        &self,
+        name: &str,
+        (purge, fence): (bool, Option<u64>),
+    ) -> Result<Removed, ApiError> {
+        self.check_fence(name, fence)?;
         self.check_known(name)?;
         let mut outcome = self.view(name).ok().and_then(|view| view.outcome);
         if let Some(mut handle) = self.handle(name) {
@@ -231,6 +249,7 @@ impl Host {
             // Only when it was the last one.
             std::fs::remove_dir(self.0.paths.federations()).ok();
         }
+        self.collect_blobs();
         Ok(Removed { outcome, kept })
     }
 
@@ -290,14 +309,20 @@ impl Host {
     /// Whether anything runs that would have nobody to stop it without a daemon.
     fn owns_something(&self) -> bool {
         let undriven = |name: &String| self.check_driven(name).is_err();
-        !self.living().is_empty() || self.names().iter().any(undriven)
+        !self.living().is_empty()
+            || !self.lease_views().is_empty()
+            || self.names().iter().any(undriven)
     }
 
     /// Refuses when processes of a run live that this daemon cannot drive.
     fn check_driven(&self, name: &str) -> Result<(), ApiError> {
         let directory = self.directory(name);
         let why = match recorded(name, &directory) {
-            Ok(Some(record)) if record.view.outcome.is_some() => return Ok(()),
+            Ok(Some(record))
+                if record.view.outcome.is_some() || record.view.state == State::Prepared =>
+            {
+                return Ok(());
+            }
             Ok(Some(_)) => directory.read_request().map(|_| ()),
             Ok(None) => Ok(()),
             Err(error) => Err(error),
@@ -342,6 +367,16 @@ impl Host {
             message: format!("there is no federation `{name}`"),
             known: self.names(),
         }
+    }
+
+    fn leases(&self) -> MutexGuard<'_, Leases> {
+        let leases = self.0.leases.lock();
+        leases.unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// The leases' time.
+    fn since(&self) -> std::time::Duration {
+        self.0.origin.elapsed()
     }
 
     fn listeners(&self) -> MutexGuard<'_, Listeners> {

@@ -7,12 +7,15 @@
 
 pub mod agent;
 pub mod api;
+pub mod blobs;
 pub mod client;
 pub mod daemon;
+mod facts;
 mod federation;
 mod files;
 mod host;
 pub mod identity;
+mod leases;
 pub mod logs;
 mod metrics;
 pub mod paths;

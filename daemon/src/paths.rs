@@ -167,6 +167,18 @@ impl Paths {
         self.run.join(format!("{instance}.sock"))
     }
 
+    /// The directory of programs that were sent, by their SHA-256.
+    #[must_use]
+    pub fn blobs(&self) -> PathBuf {
+        self.state.join("blobs")
+    }
+
+    /// Who holds which lease, and the last number given.
+    #[must_use]
+    pub fn leases(&self) -> PathBuf {
+        self.state.join("leases.json")
+    }
+
     /// The on-demand daemon's own log.
     #[must_use]
     pub fn daemon_log(&self) -> PathBuf {

@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 use std::fs;
+use std::net::SocketAddrV4;
 use std::os::unix::net::UnixStream;
 use std::path::PathBuf;
 
@@ -80,8 +81,24 @@ pub(crate) fn record(name: &str, directory: &Directory) -> Option<Record> {
     Some(Record {
         protocol: PROTOCOL,
         members,
+        rti: rti_of(directory),
         view,
     })
+}
+
+/// Where the RTI listens on another host: a federate's command line says so.
+fn rti_of(directory: &Directory) -> Option<SocketAddrV4> {
+    let request = directory.read_request().ok()?;
+    if request.part.is_none_or(|part| part.rti) {
+        return None;
+    }
+    let specs = specs(directory).into_iter();
+    let mut addresses = specs.filter_map(|path| {
+        let spec = Spec::read(&path).ok()?;
+        let mut args = spec.args.iter().skip_while(|arg| *arg != "--rti");
+        args.nth(1)?.parse().ok()
+    });
+    addresses.next()
 }
 
 /// Supervisors of this run that live: their names and, as far as the system tells, their process ids. Specs

@@ -27,6 +27,8 @@ use crate::federation::Command;
 use crate::host::Host;
 use crate::logs::Follower;
 
+mod parts;
+
 /// Lines of a stream that wait for a slow client.
 const LINES_MAX: usize = 1024;
 /// The largest request: a plan of thousands of federates.
@@ -41,7 +43,10 @@ type Told = broadcast::Receiver<Happening>;
 
 /// The routes over a host.
 pub(crate) fn router(host: Host) -> Router {
-    let federation = get(federation).post(start).delete(remove);
+    let federation = get(federation)
+        .post(start)
+        .put(parts::prepare)
+        .delete(remove);
     Router::new()
         .route("/v1/info", get(info))
         .route("/v1/federations", get(federations))
@@ -52,6 +57,7 @@ pub(crate) fn router(host: Host) -> Router {
         .route("/v1/events", get(events))
         .route("/v1/end", post(end))
         .route("/metrics", get(metrics))
+        .merge(parts::router())
         .fallback(async || bad_request("no such call; is the daemon of another version?"))
         .layer(from_fn_with_state(host.clone(), touch))
         .layer(DefaultBodyLimit::max(REQUEST_BYTES_MAX))
@@ -143,6 +149,7 @@ async fn start(
 struct StopQuery {
     #[serde(default)]
     kill: bool,
+    fence: Option<u64>,
 }
 
 async fn stop(
@@ -150,6 +157,7 @@ async fn stop(
     Path(name): Path<String>,
     Query(query): Query<StopQuery>,
 ) -> Result<Response, ApiError> {
+    host.check_fence(&name, query.fence)?;
     let told = host.subscribe();
     let (lines, body) = JsonLines::new(None);
     let Some(handle) = host.handle(&name) else {
@@ -181,6 +189,7 @@ async fn stop(
 struct RemoveQuery {
     #[serde(default)]
     purge: bool,
+    fence: Option<u64>,
 }
 
 async fn remove(
@@ -189,7 +198,7 @@ async fn remove(
     Query(query): Query<RemoveQuery>,
 ) -> Result<Json<Removed>, ApiError> {
     // In a task: a client that goes away does not leave half a removal.
-    let removal = tokio::spawn(async move { host.remove(&name, query.purge).await });
+    let removal = tokio::spawn(async move { host.remove(&name, (query.purge, query.fence)).await });
     removal
         .await
         .unwrap_or_else(|error| {

@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 use std::fs::{self, DirBuilder, OpenOptions};
 use std::io::{self, Write};
+use std::net::SocketAddrV4;
 use std::os::unix::fs::DirBuilderExt;
 use std::path::{Path, PathBuf};
 
@@ -29,6 +30,9 @@ pub struct Record {
     pub protocol: u32,
     /// Members by name; each is entered before its supervisor is started.
     pub members: BTreeMap<String, Supervised>,
+    /// Where the RTI listens, when that is another host.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub rti: Option<SocketAddrV4>,
     /// The federation as it was when the record was written.
     pub view: FederationView,
 }
@@ -153,6 +157,11 @@ impl Directory {
         self.0.join("spec")
     }
 
+    /// The working directory of the members of a part.
+    pub(crate) fn work(&self) -> PathBuf {
+        self.0.join("work")
+    }
+
     fn request(&self) -> PathBuf {
         self.0.join("request.json")
     }
@@ -176,7 +185,14 @@ impl Directory {
     pub fn prepare(&self, request: &StartRequest) -> Result<(), StoreError> {
         files::remove(&self.0).map_err(io_at(&self.0))?;
         let exit = self.0.join("exit");
-        for directory in [self.logs(), self.trace(), self.timing(), exit, self.specs()] {
+        for directory in [
+            self.logs(),
+            self.trace(),
+            self.timing(),
+            exit,
+            self.specs(),
+            self.work(),
+        ] {
             let mut builder = DirBuilder::new();
             builder
                 .recursive(true)
@@ -280,7 +296,7 @@ impl Directory {
             files::remove(&path).map_err(io_at(&path))?;
         }
         let mut kept = Vec::new();
-        for path in [self.logs(), self.trace(), self.timing()] {
+        for path in [self.logs(), self.trace(), self.timing(), self.work()] {
             // Succeeds when nothing is in it.
             if fs::remove_dir(&path).is_err() && path.exists() {
                 kept.push(path);
@@ -302,6 +318,7 @@ impl Directory {
             self.specs(),
             self.trace(),
             self.timing(),
+            self.work(),
         ] {
             files::remove(&path).map_err(io_at(&path))?;
         }

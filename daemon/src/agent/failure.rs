@@ -16,6 +16,7 @@ impl Agent {
             .federates
             .iter()
             .any(|member| member.outlived && failure.member.as_ref() == Some(&member.name));
+        let failure = Failure { rank, ..failure };
         self.failures.push(Ranked { rank, failure });
         match self.phase {
             Phase::Starting { .. } => self.undo(now, Why::Failure),
@@ -141,7 +142,9 @@ impl Agent {
                 .collect::<Vec<_>>()
                 .join(", ")
         };
-        let missing = names(&|member| !member.joined);
+        // Of a part, the RTI's host knows of all, the others of their own.
+        let known = |member: &Member| member.here || self.rti.here;
+        let missing = names(&|member| known(member) && !member.joined);
         if self.rti_port.is_none() {
             "the RTI does not listen".to_owned()
         } else if !missing.is_empty() {
@@ -149,7 +152,7 @@ impl Agent {
         } else if self.start_ns.is_none() {
             "no start tag was agreed in time".to_owned()
         } else {
-            let waiting = names(&|member| member.ours && !member.running);
+            let waiting = names(&|member| member.here && member.ours && !member.running);
             format!("the first tag was not completed in time by: {waiting}")
         }
     }

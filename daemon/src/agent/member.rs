@@ -14,6 +14,8 @@ use crate::supervisor::protocol::StopSignal;
 pub(super) struct Member {
     pub(super) name: String,
     pub(super) ours: bool,
+    /// Whether it runs on this host.
+    pub(super) here: bool,
     /// Whether the others go on without it.
     pub(super) outlived: bool,
     pub(super) process: Process,
@@ -50,6 +52,7 @@ impl Member {
         Self {
             name: name.to_owned(),
             ours,
+            here: true,
             outlived: false,
             process: Process::Waiting,
             pid: None,

@@ -2,7 +2,9 @@
 
 use ictus_coord::report::{FederateStatus, RtiStatus};
 
-use super::{Agent, FIRST_TAG_MAX, MemberId, Now, Phase, REJECTED_MAX, REMARKS_MAX, RTI, Why};
+use super::{
+    Agent, FIRST_TAG_MAX, Member, MemberId, Now, Phase, REJECTED_MAX, REMARKS_MAX, RTI, Why,
+};
 use crate::api::Event;
 
 impl Agent {
@@ -17,7 +19,7 @@ impl Agent {
             MemberId::Federate(index) => {
                 if let Ok(status) = serde_json::from_value(line.clone()) {
                     self.measure(index, &status);
-                    self.handle_federate_status(usize::from(index), status);
+                    self.handle_federate_status(now, usize::from(index), status);
                 }
             }
         }
@@ -32,11 +34,7 @@ impl Agent {
                 }
                 let joined = self.federates.iter().filter(|member| member.joined).count();
                 let of = self.federates.len();
-                if let Phase::Starting { until } = &mut self.phase
-                    && joined == of
-                {
-                    *until = now.since + FIRST_TAG_MAX;
-                }
+                self.expect_first_tag(now);
                 self.tell(Event::Joined {
                     federate: self.name(federate),
                     joined,
@@ -93,6 +91,17 @@ impl Agent {
         }
     }
 
+    /// Once everybody of whom this host knows has joined, the first tag is not far.
+    fn expect_first_tag(&mut self, now: Now) {
+        let awaited = |member: &&Member| self.rti.here || (member.here && member.ours);
+        let all_joined = self.federates.iter().filter(awaited).all(|it| it.joined);
+        if let Phase::Starting { until } = &mut self.phase
+            && all_joined
+        {
+            *until = now.since + FIRST_TAG_MAX;
+        }
+    }
+
     pub(super) fn handle_listening(&mut self, port: u16) {
         self.rti_port = Some(port);
         self.tell(Event::Listening { port });
@@ -133,13 +142,23 @@ impl Agent {
         }
     }
 
-    pub(super) fn handle_federate_status(&mut self, index: usize, status: FederateStatus) {
+    pub(super) fn handle_federate_status(
+        &mut self,
+        now: Now,
+        index: usize,
+        status: FederateStatus,
+    ) {
         let Some(member) = self.federates.get_mut(index) else {
             return;
         };
         match status {
-            // The RTI says these, for foreign federates as well.
-            FederateStatus::Joined { .. } | FederateStatus::Start { .. } => {}
+            // An RTI on this host says these, for foreign federates as well.
+            FederateStatus::Joined { .. } | FederateStatus::Start { .. } if self.rti.here => {}
+            FederateStatus::Joined { .. } => {
+                member.joined = true;
+                self.expect_first_tag(now);
+            }
+            FederateStatus::Start { start_ns, .. } => self.start_ns = Some(start_ns),
             // Measured, not told.
             FederateStatus::Measures { .. }
             | FederateStatus::Upstream { .. }
@@ -171,7 +190,7 @@ impl Agent {
             FederateStatus::Running { .. } => {
                 member.running = true;
                 let federate = member.name.clone();
-                let ours = || self.federates.iter().filter(|member| member.ours);
+                let ours = || self.federates.iter().filter(|it| it.here && it.ours);
                 let running = ours().filter(|member| member.running).count();
                 let of = ours().count();
                 self.tell(Event::Running {

@@ -7,7 +7,7 @@ use crate::api::Event;
 use crate::supervisor::protocol::StopSignal;
 
 impl Agent {
-    /// Asks the RTI for stop consensus.
+    /// Asks the RTI for stop consensus; when it runs on another host, somebody asks it there.
     pub(super) fn begin_stop(&mut self, now: Now, why: Why) {
         self.expect_stop(now, why);
         self.signal(MemberId::Rti, StopSignal::Term);

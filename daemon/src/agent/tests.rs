@@ -69,7 +69,7 @@ impl World {
 
     fn start_with(request: &StartRequest) -> Self {
         Self {
-            agent: Agent::start(at(0), request),
+            agent: Agent::start(at(0), request, None),
             now: at(0),
         }
     }
@@ -458,7 +458,7 @@ fn who_goes_away_before_healthy_undoes_and_after_it_does_not() {
 
 #[test]
 fn what_is_foreign_is_never_signalled() {
-    let mut agent = Agent::adopt(at(0), &request(), State::Running, |_| true);
+    let mut agent = Agent::adopt(at(0), &request(), (State::Running, None), |_| true);
     agent.handle_member(
         at(0),
         A,
@@ -474,7 +474,9 @@ fn what_is_foreign_is_never_signalled() {
 
 #[test]
 fn an_adopted_half_start_is_undone() {
-    let mut agent = Agent::adopt(at(0), &request(), State::Starting, |id| id == MemberId::Rti);
+    let mut agent = Agent::adopt(at(0), &request(), (State::Starting, None), |id| {
+        id == MemberId::Rti
+    });
     let signal = Action::Signal {
         member: MemberId::Rti,
         signal: StopSignal::Term,

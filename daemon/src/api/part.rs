@@ -61,6 +61,8 @@ pub struct PrepareRequest {
     pub previous: Option<String>,
     /// The id of the new run, the same on every host.
     pub id: String,
+    /// A digest of all that is deployed, by which a later `up` knows whether anything has changed.
+    pub digest: String,
     /// What to run; has a part.
     pub request: StartRequest,
 }

@@ -1,14 +1,16 @@
 //! The command lines of the RTI, of our federates and of foreign ones.
 
 use std::collections::BTreeMap;
-use std::path::Path;
+use std::net::{Ipv4Addr, SocketAddrV4};
+use std::path::{Path, PathBuf};
 
 use ictus_coord::plan::{ClockSync, OnFailure, Wire};
 use ictus_deploy::{FederateKind, FederateRun};
 
 use crate::agent::{MemberId, RTI};
 use crate::api::StartRequest;
-use crate::store::{Directory, Supervised};
+use crate::paths::Paths;
+use crate::store::{Directory, Record, Supervised};
 use crate::supervisor::log_path;
 use crate::supervisor::process::own_executable;
 use crate::supervisor::spec::{PROTOCOL, Spec};
@@ -18,37 +20,49 @@ const LINGER_MS: u32 = 5_000;
 /// Variables of the daemon that federates see, too.
 const PASSED_ON: [&str; 4] = ["HOME", "LANG", "PATH", "TZ"];
 
+/// A run as far as command lines need it.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Run<'a> {
+    pub(crate) paths: &'a Paths,
+    pub(crate) directory: &'a Directory,
+    pub(crate) request: &'a StartRequest,
+    pub(crate) record: &'a Record,
+}
+
 /// What a member's supervisor is to run.
 pub(crate) fn spec(
-    directory: &Directory,
-    request: &StartRequest,
-    federation_id: &str,
+    run: &Run<'_>,
     (member, rti_port): (MemberId, Option<u16>),
     supervised: &Supervised,
 ) -> Spec {
-    let run = match member {
+    let (directory, request) = (run.directory, run.request);
+    let federate = match member {
         MemberId::Rti => None,
         MemberId::Federate(index) => Some(&request.federates[usize::from(index)]),
     };
-    let name = run.map_or(RTI, |run| &run.name).to_owned();
+    let name = federate.map_or(RTI, |run| &run.name).to_owned();
     let mut env = passed_on();
-    let (program, args) = if let Some(run) = run {
-        env.extend(run.env.clone());
-        let rti = format!("127.0.0.1:{}", rti_port.unwrap_or(0));
+    let (program, args) = if let Some(federate) = federate {
+        env.extend(federate.env.clone());
         (
-            run.executable.clone(),
-            federate_args(run, request, directory, federation_id, &rti),
+            run.executable(federate),
+            run.federate_args(federate, run.rti(rti_port)),
         )
     } else {
-        (executable().to_path_buf(), rti_args(request, federation_id))
+        (executable().to_path_buf(), run.rti_args())
+    };
+    let cwd = if request.part.is_some() {
+        directory.work()
+    } else {
+        request.cwd.clone()
     };
     Spec {
         protocol: PROTOCOL,
         program,
         args,
         env,
-        cwd: request.cwd.clone(),
-        status: run.is_none_or(|run| run.kind == FederateKind::Ours),
+        cwd,
+        status: federate.is_none_or(|run| run.kind == FederateKind::Ours),
         log: log_path(&directory.logs(), &name),
         log_size_max: request.settings.log_max_size,
         log_files_max: request.settings.log_max_files.max(1),
@@ -70,7 +84,63 @@ fn passed_on() -> BTreeMap<String, String> {
     PASSED_ON.into_iter().filter_map(variable).collect()
 }
 
-fn rti_args(request: &StartRequest, federation_id: &str) -> Vec<String> {
+impl Run<'_> {
+    /// Where the RTI is reached from this host.
+    fn rti(&self, port: Option<u16>) -> SocketAddrV4 {
+        let address = self.request.part.as_ref().map(|part| part.address);
+        let here = SocketAddrV4::new(
+            address.unwrap_or(Ipv4Addr::LOCALHOST),
+            port.or(self.record.view.rti_port).unwrap_or(0),
+        );
+        self.record.rti.unwrap_or(here)
+    }
+
+    /// What a federate executes: a blob that was sent, or the path of the manifest.
+    fn executable(&self, federate: &FederateRun) -> PathBuf {
+        let part = self.request.part.as_ref();
+        let blob = part.and_then(|part| part.programs.get(&federate.name));
+        blob.map_or_else(
+            || federate.executable.clone(),
+            |digest| self.paths.blobs().join(digest),
+        )
+    }
+
+    fn rti_args(&self) -> Vec<String> {
+        let request = self.request;
+        let mut args = rti_args(request, &self.record.view.id, self.record.view.rti_port);
+        if let Some(part) = &request.part {
+            args.extend(["--bind".to_owned(), part.address.to_string()]);
+        }
+        args
+    }
+
+    fn federate_args(&self, run: &FederateRun, rti: SocketAddrV4) -> Vec<String> {
+        let (directory, id) = (self.directory, self.record.view.id.as_str());
+        let path = |path: &Path| path.to_string_lossy().into_owned();
+        let rti = rti.to_string();
+        match &run.kind {
+            FederateKind::Foreign { args } => {
+                let ours = ["-i", id, "--rti", &rti].map(str::to_owned);
+                ours.into_iter().chain(args.iter().cloned()).collect()
+            }
+            FederateKind::Ours => {
+                let (plan, timing) = (path(&directory.plan()), path(&directory.timing()));
+                let mut args = vec!["--plan", &plan, "--federate", &run.name];
+                args.extend(["--rti", &rti, "-i", id, "--timing", &timing]);
+                let mut args: Vec<_> = args.into_iter().map(str::to_owned).collect();
+                if let Some(part) = &self.request.part {
+                    args.extend(["--data-address".to_owned(), part.address.to_string()]);
+                }
+                if self.request.trace {
+                    args.extend(["--trace".to_owned(), path(&directory.trace())]);
+                }
+                args
+            }
+        }
+    }
+}
+
+fn rti_args(request: &StartRequest, federation_id: &str, prepared: Option<u16>) -> Vec<String> {
     let plan = &request.plan;
     let clock = match plan.clock.sync {
         ClockSync::Off | ClockSync::External => "off",
@@ -78,7 +148,8 @@ fn rti_args(request: &StartRequest, federation_id: &str) -> Vec<String> {
         ClockSync::On => "on",
     };
     let federates = request.federates.len().to_string();
-    let port = request.settings.rti_port.unwrap_or(0).to_string();
+    let port = prepared.or(request.settings.rti_port).unwrap_or(0);
+    let port = port.to_string();
     let mut args = vec!["rti", "-i", federation_id, "-n", &federates, "-p", &port];
     let (period, trials) = (
         plan.clock.period_ns.to_string(),
@@ -104,44 +175,6 @@ fn rti_args(request: &StartRequest, federation_id: &str) -> Vec<String> {
         args.extend(["--continue", &go_on]);
     }
     args.into_iter().map(str::to_owned).collect()
-}
-
-fn federate_args(
-    run: &FederateRun,
-    request: &StartRequest,
-    directory: &Directory,
-    federation_id: &str,
-    rti: &str,
-) -> Vec<String> {
-    let path = |path: &Path| path.to_string_lossy().into_owned();
-    match &run.kind {
-        FederateKind::Foreign { args } => {
-            let ours = ["-i", federation_id, "--rti", rti].map(str::to_owned);
-            ours.into_iter().chain(args.iter().cloned()).collect()
-        }
-        FederateKind::Ours => {
-            let plan = path(&directory.plan());
-            let timing = path(&directory.timing());
-            let mut args = [
-                "--plan",
-                &plan,
-                "--federate",
-                &run.name,
-                "--rti",
-                rti,
-                "-i",
-                federation_id,
-                "--timing",
-                &timing,
-            ]
-            .map(str::to_owned)
-            .to_vec();
-            if request.trace {
-                args.extend(["--trace".to_owned(), path(&directory.trace())]);
-            }
-            args
-        }
-    }
 }
 
 #[cfg(test)]
@@ -192,7 +225,7 @@ mod tests {
             trace: false,
             part: None,
         };
-        let args = rti_args(&request, "x");
+        let args = rti_args(&request, "x", None);
         assert_eq!(
             args.join(" "),
             "rti -i x -n 2 -p 0 -c on period 5000000 exchanges-per-interval 7 -a --wire 0.13 --continue 1"

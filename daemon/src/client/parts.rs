@@ -1,0 +1,242 @@
+//! The client's calls for a host's part; see [`crate::api::part`].
+
+use std::convert::Infallible;
+use std::fs::File;
+use std::io::{self, Read, Write};
+use std::path::Path;
+use std::pin::Pin;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::task::{Context, Poll};
+use std::time::Duration;
+
+use flate2::Compression;
+use flate2::write::GzEncoder;
+use hyper::Method;
+use hyper::body::{Body, Bytes, Frame};
+use tokio::sync::mpsc;
+
+use super::{Client, ClientError, Stream, encode, path, whole};
+use crate::api::part::{
+    CommitRequest, HostFacts, Lease, LeaseRequest, LeaseView, PrepareRequest, Prepared,
+};
+use crate::api::{Happening, Removed};
+
+/// How long a host may take to prepare a part, or to write down a blob after its last byte.
+const PREPARE_MAX: Duration = Duration::from_secs(120);
+/// Bytes of a blob that are compressed at a time.
+const PIECE_BYTES: usize = 64 << 10;
+/// Pieces that wait for the network.
+const PIECES_MAX: usize = 8;
+
+impl Client {
+    /// What the host is and can do.
+    ///
+    /// # Errors
+    /// See [`ClientError`].
+    pub async fn host(&self) -> Result<HostFacts, ClientError> {
+        self.answer(Method::GET, "/v1/host", Bytes::new()).await
+    }
+
+    /// Takes the lease of a federation.
+    ///
+    /// # Errors
+    /// See [`ClientError`]; held by somebody else: [`crate::api::ErrorCode::Held`].
+    pub async fn lease(&self, name: &str, request: &LeaseRequest) -> Result<Lease, ClientError> {
+        self.answer(Method::POST, &lease_path(name, &[]), json(request)?)
+            .await
+    }
+
+    /// Lets a lease last.
+    ///
+    /// # Errors
+    /// See [`ClientError`].
+    pub async fn renew(&self, name: &str, fence: u64) -> Result<Lease, ClientError> {
+        let fence = fence.to_string();
+        let path = lease_path(name, &[("fence", &fence)]);
+        self.answer(Method::PUT, &path, Bytes::new()).await
+    }
+
+    /// Gives a lease back.
+    ///
+    /// # Errors
+    /// See [`ClientError`].
+    pub async fn release(&self, name: &str, fence: u64) -> Result<(), ClientError> {
+        let fence = fence.to_string();
+        let path = lease_path(name, &[("fence", &fence)]);
+        let released: Option<LeaseView> = self.answer(Method::DELETE, &path, Bytes::new()).await?;
+        drop(released);
+        Ok(())
+    }
+
+    /// Takes a lease from whoever holds it; tells from whom.
+    ///
+    /// # Errors
+    /// See [`ClientError`].
+    pub async fn break_lease(
+        &self,
+        name: &str,
+        by: &str,
+    ) -> Result<Option<LeaseView>, ClientError> {
+        let path = lease_path(name, &[("break", by)]);
+        self.answer(Method::DELETE, &path, Bytes::new()).await
+    }
+
+    /// Leases that are held.
+    ///
+    /// # Errors
+    /// See [`ClientError`].
+    pub async fn leases(&self) -> Result<Vec<LeaseView>, ClientError> {
+        self.answer(Method::GET, "/v1/leases", Bytes::new()).await
+    }
+
+    /// Which of these blobs are not there.
+    ///
+    /// # Errors
+    /// See [`ClientError`].
+    pub async fn missing_blobs(&self, digests: &[String]) -> Result<Vec<String>, ClientError> {
+        self.answer(Method::POST, "/v1/blobs", json(&digests)?)
+            .await
+    }
+
+    /// Sends a file, compressed; gives the bytes that went over the wire. `sent` is told as they go.
+    ///
+    /// # Errors
+    /// See [`ClientError`]; the daemon refuses bytes of another digest.
+    pub async fn send_blob(
+        &self,
+        (name, fence): (&str, u64),
+        digest: &str,
+        file: &Path,
+        sent: Arc<AtomicU64>,
+    ) -> Result<u64, ClientError> {
+        let opened = File::open(file).map_err(|error| self.unreachable(error))?;
+        let (pieces, body) = mpsc::channel(PIECES_MAX);
+        tokio::task::spawn_blocking(move || compress(opened, &pieces));
+        let body = Pieces {
+            pieces: body,
+            sent: Arc::clone(&sent),
+        };
+        let fence = fence.to_string();
+        let query = encode(&[("fence", fence.as_str()), ("federation", name)]);
+        let path = format!("/v1/blobs/{digest}?{query}");
+        let (response, _connection) = self.exchange((Method::PUT, &path), body, None).await?;
+        whole(response).await?;
+        Ok(sent.load(Ordering::Relaxed))
+    }
+
+    /// Has the host write down its part; nothing of it runs yet.
+    ///
+    /// # Errors
+    /// See [`ClientError`].
+    pub async fn prepare(
+        &self,
+        (name, fence): (&str, u64),
+        request: &PrepareRequest,
+    ) -> Result<Prepared, ClientError> {
+        let fence = fence.to_string();
+        let path = path(name, "", &[("fence", &fence)]);
+        let body = http_body_util::Full::new(json(request)?);
+        let limit = Some(PREPARE_MAX);
+        let (response, _connection) = self.exchange((Method::PUT, &path), body, limit).await?;
+        let bytes = whole(response).await?;
+        serde_json::from_slice(&bytes).map_err(ClientError::NotUnderstood)
+    }
+
+    /// Begins what was prepared. Dropping the stream before `healthy` undoes the part.
+    ///
+    /// # Errors
+    /// See [`ClientError`].
+    pub async fn commit(
+        &self,
+        name: &str,
+        request: &CommitRequest,
+    ) -> Result<Stream<Happening>, ClientError> {
+        self.stream(Method::POST, &path(name, "/commit", &[]), json(request)?)
+            .await
+    }
+
+    /// Stops a part in order; the stream ends with its end.
+    ///
+    /// # Errors
+    /// See [`ClientError`].
+    pub async fn stop_part(
+        &self,
+        (name, fence): (&str, u64),
+        kill: bool,
+    ) -> Result<Stream<Happening>, ClientError> {
+        let (kill, fence) = (kill.to_string(), fence.to_string());
+        let path = path(name, "/stop", &[("kill", &kill), ("fence", &fence)]);
+        self.stream(Method::POST, &path, Bytes::new()).await
+    }
+
+    /// Stops a part if it runs and removes what it left.
+    ///
+    /// # Errors
+    /// See [`ClientError`].
+    pub async fn remove_part(
+        &self,
+        (name, fence): (&str, u64),
+        purge: bool,
+    ) -> Result<Removed, ClientError> {
+        let (purge, fence) = (purge.to_string(), fence.to_string());
+        let path = path(name, "", &[("purge", &purge), ("fence", &fence)]);
+        self.answer(Method::DELETE, &path, Bytes::new()).await
+    }
+}
+
+fn json(value: &impl serde::Serialize) -> Result<Bytes, ClientError> {
+    let bytes = serde_json::to_vec(value).map_err(ClientError::NotUnderstood)?;
+    Ok(bytes.into())
+}
+
+fn lease_path(name: &str, query: &[(&str, &str)]) -> String {
+    format!("/v1/leases/{}?{}", super::escape(name), encode(query))
+}
+
+/// Compresses a file piece by piece until nobody takes them. A file that cannot be read ends early, and its digest is
+/// then another one.
+fn compress(mut file: File, pieces: &mpsc::Sender<Bytes>) {
+    let mut encoder = GzEncoder::new(Vec::new(), Compression::fast());
+    let mut buffer = vec![0; PIECE_BYTES];
+    let mut next = || -> io::Result<Option<Bytes>> {
+        let count = file.read(&mut buffer)?;
+        if count == 0 {
+            return Ok(None);
+        }
+        encoder.write_all(&buffer[..count])?;
+        Ok(Some(std::mem::take(encoder.get_mut()).into()))
+    };
+    while let Ok(Some(piece)) = next() {
+        if !piece.is_empty() && pieces.blocking_send(piece).is_err() {
+            return;
+        }
+    }
+    if let Ok(rest) = encoder.finish() {
+        pieces.blocking_send(rest.into()).ok();
+    }
+}
+
+/// A request's body of pieces.
+struct Pieces {
+    pieces: mpsc::Receiver<Bytes>,
+    sent: Arc<AtomicU64>,
+}
+
+impl Body for Pieces {
+    type Data = Bytes;
+    type Error = Infallible;
+
+    fn poll_frame(
+        mut self: Pin<&mut Self>,
+        context: &mut Context<'_>,
+    ) -> Poll<Option<Result<Frame<Bytes>, Infallible>>> {
+        let piece = self.pieces.poll_recv(context);
+        piece.map(|piece| {
+            let piece = piece?;
+            let count = u64::try_from(piece.len()).unwrap_or(u64::MAX);
+            self.sent.fetch_add(count, Ordering::Relaxed);
+            Some(Ok(Frame::data(piece)))
+        })
+    }
+}

@@ -1,0 +1,45 @@
+//! What this host is and can do.
+
+use std::fs;
+
+use crate::api::part::{DockerFacts, HostFacts};
+use crate::paths::Paths;
+
+/// Asks the system, but not the Docker engine.
+pub(crate) fn of_this_host(paths: &Paths, docker: Result<DockerFacts, String>) -> HostFacts {
+    let name = rustix::system::uname();
+    let word = |text: &std::ffi::CStr| text.to_string_lossy().into_owned();
+    let cpus = std::thread::available_parallelism().map_or(1, |found| found.get());
+    let existing = paths.state.ancestors().find(|path| path.exists());
+    let disk = existing.and_then(|path| rustix::fs::statvfs(path).ok());
+    HostFacts {
+        version: env!("CARGO_PKG_VERSION").to_owned(),
+        arch: std::env::consts::ARCH.to_owned(),
+        kernel: word(name.release()),
+        hostname: word(name.nodename()),
+        user: user(),
+        cpus: u32::try_from(cpus).unwrap_or(u32::MAX),
+        disk_free: disk.map_or(0, |disk| disk.f_bavail.saturating_mul(disk.f_frsize)),
+        realtime: realtime(),
+        docker,
+        starts_at_boot: false,
+    }
+}
+
+/// The user's name; its number when there is none.
+fn user() -> String {
+    let uid = rustix::process::geteuid().as_raw().to_string();
+    let passwd = fs::read_to_string("/etc/passwd").unwrap_or_default();
+    let mut lines = passwd.lines().map(|line| line.split(':'));
+    let name = lines.find_map(|mut fields| {
+        let name = fields.next()?;
+        (fields.nth(1)? == uid).then(|| name.to_owned())
+    });
+    name.unwrap_or(uid)
+}
+
+/// Whether the limits allow a realtime priority. Root needs no limit, but a container's cgroup may still refuse it.
+fn realtime() -> bool {
+    let limit = rustix::process::getrlimit(rustix::process::Resource::Rtprio);
+    limit.current.is_none_or(|limit| limit > 0)
+}

@@ -1,0 +1,287 @@
+//! A host's part of a federation over several hosts: leases, blobs, prepare, commit.
+
+use std::collections::BTreeSet;
+use std::io::Read;
+use std::net::{Ipv4Addr, SocketAddrV4, TcpListener};
+
+use crate::api::part::{
+    CommitRequest, Lease, LeaseRequest, LeaseView, Part, PrepareRequest, Prepared,
+};
+use crate::api::{ApiError, ErrorCode, State};
+use crate::blobs::{BlobError, Blobs};
+use crate::federation::{Federation, Handle};
+use crate::files;
+use crate::leases::{LeaseError, Leases};
+use crate::stamp;
+use crate::store::{self, StoreError};
+
+use super::{Host, recorded, store_error, validate, with_sources};
+
+impl Host {
+    /// Takes over what an earlier daemon kept of leases.
+    pub(crate) fn restore_leases(&self) {
+        let stored = std::fs::read(self.paths().leases());
+        let stored = stored
+            .ok()
+            .and_then(|bytes| serde_json::from_slice(&bytes).ok());
+        *self.leases() = Leases::restored(stored.unwrap_or_default(), self.since());
+    }
+
+    /// Gives a lease.
+    pub(crate) fn take_lease(&self, name: &str, request: &LeaseRequest) -> Result<Lease, ApiError> {
+        if !store::is_name(name) {
+            let message = format!("`{name}` cannot be a federation's name");
+            return Err(error(ErrorCode::BadRequest, message));
+        }
+        let now = (self.since(), stamp::now_ns());
+        self.change_leases(|leases| leases.take(now, name, request))
+    }
+
+    /// Lets a lease last.
+    pub(crate) fn renew_lease(&self, name: &str, fence: u64) -> Result<Lease, ApiError> {
+        let since = self.since();
+        self.leases()
+            .renew(since, name, fence)
+            .map_err(|e| held(&e))
+    }
+
+    /// Takes a lease back.
+    pub(crate) fn release_lease(&self, name: &str, fence: u64) -> Result<(), ApiError> {
+        let since = self.since();
+        self.change_leases(|leases| leases.release(since, name, fence))
+    }
+
+    /// Takes a lease from whoever holds it, and writes down who did.
+    pub(crate) fn break_lease(&self, name: &str, by: &str) -> Result<Option<LeaseView>, ApiError> {
+        let since = self.since();
+        let broken = self.change_leases(|leases| Ok(leases.break_off(since, name)))?;
+        if let Some(lease) = &broken {
+            tracing::warn!(federation = name, by, of = lease.who, "a lease was broken");
+        }
+        Ok(broken)
+    }
+
+    /// Leases that are held.
+    pub(crate) fn lease_views(&self) -> Vec<LeaseView> {
+        self.leases().views(self.since())
+    }
+
+    /// Refuses a change by anybody but the holder of the lease.
+    pub(crate) fn check_fence(&self, name: &str, fence: Option<u64>) -> Result<(), ApiError> {
+        let since = self.since();
+        self.leases()
+            .check(since, name, fence)
+            .map_err(|e| held(&e))
+    }
+
+    /// Blobs that are not there.
+    pub(crate) fn missing_blobs(&self, digests: &[String]) -> Result<Vec<String>, ApiError> {
+        let missing = self.blobs().missing(digests);
+        missing.map_err(|error| blob_error(&error))
+    }
+
+    /// Takes a blob.
+    pub(crate) fn write_blob(&self, digest: &str, from: impl Read) -> Result<(), ApiError> {
+        let written = self.blobs().write(digest, from);
+        written.map_err(|error| blob_error(&error))
+    }
+
+    /// Removes blobs that no run of this host needs; those of a change that is under way are needed.
+    pub(crate) fn collect_blobs(&self) {
+        if !self.lease_views().is_empty() {
+            return;
+        }
+        let requests = self.names();
+        let requests = requests
+            .iter()
+            .filter_map(|name| self.directory(name).read_request().ok());
+        let needed: BTreeSet<String> = requests
+            .filter_map(|request| request.part)
+            .flat_map(|part| part.programs.into_values())
+            .collect();
+        if let Err(error) = self.blobs().keep_only(&needed) {
+            tracing::warn!(%error, "blobs were not removed");
+        }
+    }
+
+    /// Writes down a part that may be committed; nothing of it runs. What is left of an earlier run makes way.
+    pub(crate) fn prepare(
+        &self,
+        name: &str,
+        fence: u64,
+        prepare: &PrepareRequest,
+    ) -> Result<Prepared, ApiError> {
+        self.check_fence(name, Some(fence))?;
+        let request = &prepare.request;
+        validate(name, request)?;
+        let bad = |what: &str| error(ErrorCode::BadRequest, what.to_owned());
+        let part = request
+            .part
+            .as_ref()
+            .ok_or_else(|| bad("there is no part"))?;
+        if !store::is_name(&prepare.id) {
+            return Err(bad("the run's id is none"));
+        }
+        validate_part(part, request.federates.len()).map_err(|what| bad(&what))?;
+        self.check_previous(name, prepare)?;
+        self.check_driven(name)?;
+        let programs: Vec<_> = part.programs.values().cloned().collect();
+        if let Some(missing) = self.missing_blobs(&programs)?.first() {
+            let what = format!("program {missing} was not sent");
+            return Err(error(ErrorCode::Failed, what));
+        }
+        let rti_port = part
+            .rti
+            .then(|| free_port(part, request.settings.rti_port))
+            .transpose()?;
+        let id = prepare.id.clone();
+        let prepared = Federation::prepare(self.paths(), name, request, id);
+        let (directory, mut record) = prepared.map_err(|error| store_error(&error))?;
+        record.view.rti_port = rti_port.flatten();
+        record.view.digest.clone_from(&prepare.digest);
+        let written = directory.write_record(&record);
+        written.map_err(|error| store_error(&error))?;
+        Ok(Prepared {
+            id: record.view.id,
+            rti_port: record.view.rti_port,
+        })
+    }
+
+    /// Begins what was prepared.
+    pub(crate) fn commit(&self, name: &str, commit: &CommitRequest) -> Result<Handle, ApiError> {
+        self.check_fence(name, Some(commit.fence))?;
+        let directory = self.known_directory(name)?;
+        let record = recorded(name, &directory).map_err(|error| store_error(&error))?;
+        let prepared = record.filter(|record| {
+            record.view.state == State::Prepared
+                && record.view.id == commit.id
+                && self.handle(name).is_none()
+        });
+        let Some(mut record) = prepared else {
+            let what = format!("run {} of federation `{name}` is not prepared", commit.id);
+            return Err(error(ErrorCode::Conflict, what));
+        };
+        let request = directory
+            .read_request()
+            .map_err(|error| store_error(&error))?;
+        if let (Some(part), Some(port)) = (&request.part, record.view.rti_port) {
+            // Somebody may have taken it since.
+            bind(part.address, port).map_err(|why| taken(part, port, &why))?;
+        }
+        record.view.metrics = self.listen(name, request.settings.metrics_listen)?;
+        let told = self.0.told.clone();
+        let state = (request, record, commit.rti);
+        let (federation, handle) = Federation::begin(self.paths(), directory, state, told);
+        self.spawn(name.to_owned(), federation, handle.clone());
+        Ok(handle)
+    }
+
+    /// The run that is there must be the one that was seen when this was planned, and must not run.
+    fn check_previous(&self, name: &str, prepare: &PrepareRequest) -> Result<(), ApiError> {
+        if self.handle(name).is_some() {
+            let what = format!("federation `{name}` runs here; it is stopped first");
+            return Err(error(ErrorCode::Conflict, what));
+        }
+        let there = self.view(name).ok().map(|view| view.id);
+        if there == prepare.previous || there.as_ref() == Some(&prepare.id) {
+            return Ok(());
+        }
+        let word = |id: &Option<String>| id.clone().unwrap_or_else(|| "nothing".to_owned());
+        let what = format!(
+            "federation `{name}` has changed here since it was looked at: planned on {}, found {}",
+            word(&prepare.previous),
+            word(&there)
+        );
+        Err(error(ErrorCode::Conflict, what))
+    }
+
+    fn blobs(&self) -> Blobs {
+        Blobs::new(self.paths().blobs())
+    }
+
+    /// Changes leases and keeps what a later daemon needs of them.
+    fn change_leases<T>(
+        &self,
+        change: impl FnOnce(&mut Leases) -> Result<T, LeaseError>,
+    ) -> Result<T, ApiError> {
+        let mut leases = self.leases();
+        let mut changed = leases.clone();
+        let result = change(&mut changed).map_err(|error| held(&error))?;
+        let path = self.paths().leases();
+        let written = match changed.stored() {
+            Some(stored) => serde_json::to_vec(&stored)
+                .map_err(Into::into)
+                .and_then(|bytes| files::write_durably(&path, &bytes)),
+            None => files::remove(&path),
+        };
+        written.map_err(|source| store_error(&StoreError::Io { path, source }))?;
+        *leases = changed;
+        Ok(result)
+    }
+}
+
+fn validate_part(part: &Part, federates: usize) -> Result<(), String> {
+    if let Some(id) = part
+        .federates
+        .iter()
+        .find(|id| usize::from(**id) >= federates)
+    {
+        return Err(format!("there is no federate {id}"));
+    }
+    let named = part.hosts.get(&part.host);
+    if named.is_none_or(|host| host.address != part.address) {
+        return Err(format!("host `{}` is not among the hosts", part.host));
+    }
+    Ok(())
+}
+
+/// The port for the RTI: the one that is asked for, or a free one of the range; absent when any will do.
+fn free_port(part: &Part, wanted: Option<u16>) -> Result<Option<u16>, ApiError> {
+    if let Some(port) = wanted {
+        bind(part.address, port).map_err(|why| taken(part, port, &why))?;
+        return Ok(Some(port));
+    }
+    let Some(range) = part.ports else {
+        return Ok(None);
+    };
+    let mut ports = range.first..=range.last;
+    let free = ports.find(|port| bind(part.address, *port).is_ok());
+    free.map(Some).ok_or_else(|| {
+        let (host, address) = (&part.host, part.address);
+        let what = format!(
+            "host `{host}`: no port from {} to {} of {address} is free, or {address} is not its address",
+            range.first, range.last
+        );
+        error(ErrorCode::Failed, what)
+    })
+}
+
+fn bind(address: Ipv4Addr, port: u16) -> std::io::Result<()> {
+    TcpListener::bind(SocketAddrV4::new(address, port)).map(drop)
+}
+
+fn taken(part: &Part, port: u16, why: &std::io::Error) -> ApiError {
+    let (host, address) = (&part.host, part.address);
+    let what = format!("host `{host}`: the RTI cannot have port {port} of {address}: {why}");
+    error(ErrorCode::Failed, what)
+}
+
+fn held(lease: &LeaseError) -> ApiError {
+    error(ErrorCode::Held, lease.to_string())
+}
+
+fn blob_error(blob: &BlobError) -> ApiError {
+    let code = match blob {
+        BlobError::Name(_) | BlobError::Different { .. } => ErrorCode::BadRequest,
+        BlobError::Io { .. } => ErrorCode::Failed,
+    };
+    error(code, with_sources(blob))
+}
+
+fn error(code: ErrorCode, message: String) -> ApiError {
+    ApiError {
+        code,
+        message,
+        known: Vec::new(),
+    }
+}

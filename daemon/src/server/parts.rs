@@ -1,0 +1,183 @@
+//! The routes of a host's part; see [`crate::api::part`].
+
+use std::io::{self, Read};
+
+use axum::Router;
+use axum::body::{Body, Bytes};
+use axum::extract::{DefaultBodyLimit, Path, Query, State};
+use axum::response::{Json, Response};
+use axum::routing::{get, post, put};
+use futures_util::StreamExt;
+use serde::Deserialize;
+use serde::de::DeserializeOwned;
+use tokio::sync::mpsc;
+
+use crate::api::part::{
+    CommitRequest, HostFacts, Lease, LeaseRequest, LeaseView, PrepareRequest, Prepared,
+};
+use crate::api::{ApiError, ErrorCode};
+use crate::facts;
+use crate::host::Host;
+
+use super::{JsonLines, StarterGuard, bad_request, pass_until_end, stream};
+
+/// Pieces of a blob that wait for the disk.
+const PIECES_MAX: usize = 16;
+
+/// The routes.
+pub(super) fn router() -> Router<Host> {
+    let lease = post(take).put(renew).delete(release);
+    // A blob is written as it comes, and may be of any size.
+    let blob = put(write_blob).layer(DefaultBodyLimit::disable());
+    Router::new()
+        .route("/v1/host", get(host_facts))
+        .route("/v1/leases", get(leases))
+        .route("/v1/leases/{name}", lease)
+        .route("/v1/blobs", post(missing))
+        .route("/v1/blobs/{digest}", blob)
+        .route("/v1/federations/{name}/commit", post(commit))
+}
+
+#[derive(Deserialize)]
+pub(super) struct FenceQuery {
+    fence: u64,
+}
+
+#[derive(Deserialize)]
+struct ReleaseQuery {
+    fence: Option<u64>,
+    /// Who breaks it.
+    r#break: Option<String>,
+}
+
+#[derive(Deserialize)]
+struct BlobQuery {
+    fence: u64,
+    federation: String,
+}
+
+async fn host_facts(State(host): State<Host>) -> Json<HostFacts> {
+    let docker = Err("this daemon does not use Docker".to_owned());
+    Json(facts::of_this_host(host.paths(), docker))
+}
+
+async fn leases(State(host): State<Host>) -> Json<Vec<LeaseView>> {
+    Json(host.lease_views())
+}
+
+async fn take(
+    State(host): State<Host>,
+    Path(name): Path<String>,
+    body: Bytes,
+) -> Result<Json<Lease>, ApiError> {
+    let request: LeaseRequest = parse(&body)?;
+    host.take_lease(&name, &request).map(Json)
+}
+
+async fn renew(
+    State(host): State<Host>,
+    Path(name): Path<String>,
+    Query(query): Query<FenceQuery>,
+) -> Result<Json<Lease>, ApiError> {
+    host.renew_lease(&name, query.fence).map(Json)
+}
+
+async fn release(
+    State(host): State<Host>,
+    Path(name): Path<String>,
+    Query(query): Query<ReleaseQuery>,
+) -> Result<Json<Option<LeaseView>>, ApiError> {
+    match (query.fence, query.r#break) {
+        (Some(fence), None) => {
+            host.release_lease(&name, fence)?;
+            host.collect_blobs();
+            Ok(Json(None))
+        }
+        (None, Some(by)) => host.break_lease(&name, &by).map(Json),
+        (Some(_), Some(_)) | (None, None) => Err(bad_request("either `fence` or `break`")),
+    }
+}
+
+async fn missing(State(host): State<Host>, body: Bytes) -> Result<Json<Vec<String>>, ApiError> {
+    let digests: Vec<String> = parse(&body)?;
+    host.missing_blobs(&digests).map(Json)
+}
+
+async fn write_blob(
+    State(host): State<Host>,
+    Path(digest): Path<String>,
+    Query(query): Query<BlobQuery>,
+    body: Body,
+) -> Result<Json<()>, ApiError> {
+    host.check_fence(&query.federation, Some(query.fence))?;
+    let (pieces, arriving) = mpsc::channel(PIECES_MAX);
+    let writing = tokio::task::spawn_blocking(move || {
+        let bytes = flate2::read::GzDecoder::new(Pieces {
+            arriving,
+            current: Bytes::new(),
+        });
+        host.write_blob(&digest, bytes)
+    });
+    let mut body = body.into_data_stream();
+    while let Some(piece) = body.next().await {
+        let piece = piece.map_err(io::Error::other);
+        // Closed when the disk does not take it, which is told below.
+        if pieces.send(piece).await.is_err() {
+            break;
+        }
+    }
+    drop(pieces);
+    let failed = |error: tokio::task::JoinError| ApiError {
+        code: ErrorCode::Failed,
+        message: error.to_string(),
+        known: Vec::new(),
+    };
+    writing.await.map_err(failed)?.map(Json)
+}
+
+fn parse<T: DeserializeOwned>(body: &Bytes) -> Result<T, ApiError> {
+    serde_json::from_slice(body).map_err(|error| bad_request(&error.to_string()))
+}
+
+/// What arrives, as a reader.
+struct Pieces {
+    arriving: mpsc::Receiver<io::Result<Bytes>>,
+    current: Bytes,
+}
+
+impl Read for Pieces {
+    fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
+        while self.current.is_empty() {
+            match self.arriving.blocking_recv() {
+                Some(piece) => self.current = piece?,
+                None => return Ok(0),
+            }
+        }
+        let count = buffer.len().min(self.current.len());
+        buffer[..count].copy_from_slice(&self.current.split_to(count));
+        Ok(count)
+    }
+}
+
+pub(super) async fn prepare(
+    State(host): State<Host>,
+    Path(name): Path<String>,
+    Query(query): Query<FenceQuery>,
+    body: Bytes,
+) -> Result<Json<Prepared>, ApiError> {
+    let request: PrepareRequest = parse(&body)?;
+    host.prepare(&name, query.fence, &request).map(Json)
+}
+
+async fn commit(
+    State(host): State<Host>,
+    Path(name): Path<String>,
+    body: Bytes,
+) -> Result<Response, ApiError> {
+    let request: CommitRequest = parse(&body)?;
+    let told = host.subscribe();
+    let handle = host.commit(&name, &request)?;
+    let (lines, body) = JsonLines::new(Some(StarterGuard(handle.commands)));
+    tokio::spawn(pass_until_end(told, name, lines));
+    Ok(stream(body))
+}
