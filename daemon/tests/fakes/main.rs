@@ -286,6 +286,13 @@ fn member(options: &BTreeMap<String, String>, manner: &str) -> ExitCode {
         let Ok(line) = line else { break };
         match line.as_str() {
             "start" => {
+                status.say(&FederateStatus::Joined {
+                    federate: federate.clone(),
+                });
+                status.say(&FederateStatus::Start {
+                    federate: federate.clone(),
+                    start_ns: ictusd::stamp::now_ns(),
+                });
                 status.say(&FederateStatus::Running {
                     federate: federate.clone(),
                 });

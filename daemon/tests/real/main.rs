@@ -9,5 +9,6 @@
 
 mod daemon;
 mod metrics;
+mod parts;
 mod supervisor;
 mod world;
