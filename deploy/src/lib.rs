@@ -21,6 +21,7 @@ pub mod problem;
 mod program;
 mod quantity;
 mod reactions;
+pub mod rollout;
 mod spans;
 mod structure;
 mod suggest;
