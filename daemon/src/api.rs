@@ -15,6 +15,7 @@
 //!
 //! Errors are [`ApiError`] with a status of 400 and up.
 
+use std::collections::BTreeMap;
 use std::net::SocketAddr;
 use std::path::PathBuf;
 
@@ -103,6 +104,9 @@ pub struct FederationView {
     /// A digest of what it was prepared from, by which a later `up` knows whether anything has changed.
     #[serde(default, skip_serializing_if = "String::is_empty")]
     pub digest: String,
+    /// The digest of each thing that matters, by what it is.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub facets: BTreeMap<String, String>,
 }
 
 /// Where a federation stands in its life.

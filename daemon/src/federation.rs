@@ -143,6 +143,7 @@ impl Federation {
             outcome: None,
             part: request.part.clone(),
             digest: String::new(),
+            facets: BTreeMap::new(),
         };
         let record = Record {
             protocol: PROTOCOL,

@@ -430,6 +430,7 @@ fn unreadable_view(name: &str, directory: &Directory, error: &StoreError) -> Fed
         }),
         part: None,
         digest: String::new(),
+        facets: BTreeMap::new(),
     }
 }
 

@@ -49,6 +49,7 @@ pub(crate) fn record(name: &str, directory: &Directory) -> Option<Record> {
         outcome: None,
         part: None,
         digest: String::new(),
+        facets: BTreeMap::new(),
     };
     for happening in events {
         let by_user = |by: &str| by == "user" && view.state == State::Running;

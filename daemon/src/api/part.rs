@@ -63,6 +63,9 @@ pub struct PrepareRequest {
     pub id: String,
     /// A digest of all that is deployed, by which a later `up` knows whether anything has changed.
     pub digest: String,
+    /// The digest of each thing that matters, by what it is, by which a later `up` says what has changed.
+    #[serde(default)]
+    pub facets: BTreeMap<String, String>,
     /// What to run; has a part.
     pub request: StartRequest,
 }

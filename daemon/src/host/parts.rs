@@ -139,6 +139,7 @@ impl Host {
         let (directory, mut record) = prepared.map_err(|error| store_error(&error))?;
         record.view.rti_port = rti_port.flatten();
         record.view.digest.clone_from(&prepare.digest);
+        record.view.facets.clone_from(&prepare.facets);
         let written = directory.write_record(&record);
         written.map_err(|error| store_error(&error))?;
         Ok(Prepared {

@@ -100,6 +100,7 @@ fn snapshot(federation: &str) -> Snapshot {
             outcome: None,
             part: None,
             digest: String::new(),
+            facets: BTreeMap::new(),
         },
         measures: FederationMeasures {
             federation: federation.to_owned(),

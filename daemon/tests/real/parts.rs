@@ -48,6 +48,7 @@ fn prepare(request: StartRequest, previous: Option<&str>) -> PrepareRequest {
         previous: previous.map(str::to_owned),
         id: "run-1".to_owned(),
         digest: "of all".to_owned(),
+        facets: BTreeMap::new(),
         request,
     }
 }
