@@ -14,7 +14,8 @@ use crate::error::{CliError, USAGE};
 use crate::ui::Ui;
 
 const EXIT_CODES: &str =
-    "Exit codes: 0 done, 1 failed, 3 the manifest has mistakes, 6 not in time, 64 wrong usage";
+    "Exit codes: 0 done, 1 failed, 2 `plan`: there are changes, 3 the manifest has mistakes, 4 a host cannot be reached, \
+     5 somebody else is at it, 6 not in time, 8 done on some hosts only, 64 wrong usage";
 
 /// Run federations of deterministic reactors from one manifest
 #[derive(Debug, Parser)]
@@ -74,6 +75,9 @@ enum Command {
     Rti(PassedOn),
     /// Serve the API; `up` starts it when it is needed
     Daemon,
+    /// Connect standard input and output to this user's daemon
+    #[command(hide = true)]
+    DialStdio,
     #[command(hide = true)]
     Supervise(commands::supervise::Supervise),
 }
@@ -113,7 +117,7 @@ pub(crate) fn dispatch(args: Vec<OsString>) -> ExitCode {
     if first == Some(OsStr::new(shim::COMMAND)) {
         return shim::exec(args.into_iter().skip(2));
     }
-    let args = if name == Some(OsStr::new("ictusd")) {
+    let args = if name == Some(OsStr::new("ictusd")) && first != Some(OsStr::new("dial-stdio")) {
         vec![OsString::from("ictusd"), OsString::from("daemon")]
             .into_iter()
             .chain(args.into_iter().skip(1))
@@ -147,6 +151,7 @@ fn run(cli: Cli) -> ExitCode {
         Command::Explain(it) => it.run(&mut ui),
         Command::Rti(it) => return ictus_rti::run(it.args),
         Command::Daemon => commands::daemon::run(),
+        Command::DialStdio => commands::dial_stdio::run(),
         Command::Supervise(it) => it.run(),
     };
     match result {

@@ -3,6 +3,7 @@
 pub(crate) mod bench;
 pub(crate) mod check;
 pub(crate) mod daemon;
+pub(crate) mod dial_stdio;
 pub(crate) mod down;
 pub(crate) mod events;
 pub(crate) mod explain;

@@ -25,6 +25,14 @@ pub(crate) enum Kind {
     Failed,
     /// The manifest has mistakes.
     Manifest,
+    /// A host cannot be reached, or does not let us in.
+    Unreachable,
+    /// Somebody else changes the federation.
+    Held,
+    /// Done on some hosts only.
+    Partial,
+    /// There is something to do (`plan`); nothing is wrong.
+    Changes,
     /// It did not become healthy, or did not end, in time.
     Timeout,
     /// The daemon went away; what runs goes on.
@@ -61,7 +69,11 @@ impl CliError {
     pub(crate) fn code(&self) -> u8 {
         match self.kind {
             Kind::Failed | Kind::DaemonGone => 1,
+            Kind::Changes => 2,
             Kind::Manifest => 3,
+            Kind::Unreachable => 4,
+            Kind::Held => 5,
+            Kind::Partial => 8,
             Kind::Timeout => 6,
             Kind::BrokenPipe => 0,
         }

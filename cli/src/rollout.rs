@@ -1,0 +1,181 @@
+//! `up` and `down` over several hosts: looks at all, plans, and carries exactly that plan out.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::io;
+use std::net::Ipv4Addr;
+use std::path::{Path, PathBuf};
+
+use ictus_deploy::placement::{Placement, Way};
+use ictus_deploy::rollout::{Desired, Observed, Plan, ProgramFile, Reason, Refusal, plan, plan_down};
+use ictus_deploy::{Checked, image};
+use ictusd::api::StartRequest;
+use ictusd::api::part::{HostRef, Part};
+use ictusd::blobs;
+
+use crate::error::{CliError, Kind};
+use crate::hosts::{Clients, connect_all, ways};
+use crate::session::{Session, request};
+
+mod execute;
+mod observe;
+
+pub(crate) use execute::{Executor, Verdict};
+
+/// How long an ordered stop of a federation may take of which no manifest says more, in milliseconds.
+const STOP_LIMIT_MS: u64 = 60_000;
+
+/// A checked manifest with hosts, and what they said.
+#[derive(Debug)]
+pub(crate) struct Rollout<'a> {
+    checked: &'a Checked,
+    pub(crate) placement: &'a Placement,
+    trace: bool,
+    desired: Desired,
+    /// Program files by digest.
+    files: BTreeMap<String, PathBuf>,
+    pub(crate) clients: Clients,
+    pub(crate) plan: Plan,
+}
+
+impl<'a> Rollout<'a> {
+    /// Looks at every host and plans.
+    pub(crate) async fn new(
+        session: &Session,
+        checked: &'a Checked,
+        placement: &'a Placement,
+        trace: bool,
+    ) -> Result<Self, CliError> {
+        let mut files = BTreeMap::new();
+        let desired = Desired::of(checked, trace, &mut |path| {
+            let file = program_file(path)?;
+            files.insert(file.digest.clone(), path.to_path_buf());
+            Ok(file)
+        });
+        let desired = desired.map_err(CliError::failed)?;
+        let connected = connect_all(session, &ways(placement)).await;
+        let blobs = |host: &str| -> Vec<String> {
+            let host = desired.hosts.get(host);
+            let blobs = host.map(|host| host.blobs.iter().map(|it| it.digest.clone()));
+            blobs.into_iter().flatten().collect()
+        };
+        let (clients, observed) =
+            observe::all(connected, &desired.federation, &blobs).await;
+        let plan = plan(&desired, &observed).map_err(refused)?;
+        Ok(Self {
+            checked,
+            placement,
+            trace,
+            desired,
+            files,
+            clients,
+            plan,
+        })
+    }
+
+    /// Whether everything runs as the manifest says.
+    pub(crate) fn is_done(&self) -> bool {
+        self.plan.is_empty()
+    }
+
+    /// What a host is asked to run.
+    fn part_request(&self, host: &str) -> Option<StartRequest> {
+        let index = self.placement.hosts.iter().position(|it| it.name == host)?;
+        let spec = &self.placement.hosts[index];
+        let runs = self.checked.federates.iter().zip(&self.placement.federates);
+        let here: Vec<_> = runs.filter(|(_, at)| **at == index).map(|(run, _)| run).collect();
+        let sent = |digest: &String| {
+            let wanted = self.desired.hosts.get(host);
+            wanted.is_some_and(|host| host.blobs.iter().any(|blob| blob.digest == *digest))
+        };
+        let program = |run: &&ictus_deploy::FederateRun| {
+            let found = self.files.iter().find(|(digest, file)| {
+                **file == run.executable && sent(digest)
+            })?;
+            Some((run.name.clone(), found.0.clone()))
+        };
+        let part = Part {
+            host: host.to_owned(),
+            hosts: self.host_refs(),
+            rti: self.placement.rti == index,
+            federates: here.iter().map(|run| run.id).collect(),
+            address: self.address(spec.address),
+            engine: spec.engine,
+            ports: spec.ports,
+            programs: here.iter().filter_map(program).collect(),
+        };
+        Some(StartRequest {
+            part: Some(part),
+            ..request(self.checked, self.trace)
+        })
+    }
+
+    fn host_refs(&self) -> BTreeMap<String, HostRef> {
+        let hosts = self.placement.hosts.iter();
+        let reference = |way: &Way, address| HostRef {
+            way: way.clone(),
+            address: self.address(address),
+        };
+        hosts
+            .map(|host| (host.name.clone(), reference(&host.way, host.address)))
+            .collect()
+    }
+
+    /// Where all share a host, nobody else can reach them.
+    fn address(&self, address: Ipv4Addr) -> Ipv4Addr {
+        if self.placement.hosts.len() == 1 {
+            Ipv4Addr::LOCALHOST
+        } else {
+            address
+        }
+    }
+
+    fn rti_address(&self) -> Option<Ipv4Addr> {
+        let host = self.placement.hosts.get(self.placement.rti)?;
+        Some(self.address(host.address))
+    }
+}
+
+/// What is planned to take a federation down, and on whom it is carried out.
+pub(crate) async fn down(
+    session: &Session,
+    name: &str,
+    ways: &BTreeMap<String, Way>,
+    purge: bool,
+) -> Result<(Clients, Plan), CliError> {
+    let connected = connect_all(session, ways).await;
+    let (clients, observed) = observe::all(connected, name, &|_| Vec::new()).await;
+    let plan = plan_down(name, &observed, purge, STOP_LIMIT_MS).map_err(refused)?;
+    Ok((clients, plan))
+}
+
+/// What a program file is; its architecture stands in its header.
+fn program_file(path: &Path) -> io::Result<ProgramFile> {
+    let bytes = std::fs::metadata(path)?.len();
+    let digest = blobs::digest(std::fs::File::open(path)?)?;
+    let arch = image::elf::rust_arch(path).map_err(io::Error::other)?;
+    Ok(ProgramFile {
+        digest,
+        bytes,
+        arch,
+    })
+}
+
+fn refused(refusal: Refusal) -> CliError {
+    let is = |wanted: fn(&Reason) -> bool| refusal.reasons.iter().any(wanted);
+    let kind = if is(|it| matches!(it, Reason::Unreachable { .. })) {
+        Kind::Unreachable
+    } else if is(|it| matches!(it, Reason::Held { .. })) {
+        Kind::Held
+    } else {
+        Kind::Failed
+    };
+    CliError::new(kind, refusal.to_string())
+}
+
+/// Hosts that were observed, for those that need only this.
+pub(crate) type ObservedHosts = BTreeMap<String, Observed>;
+
+/// The names of hosts, for messages.
+pub(crate) fn listed(hosts: &BTreeSet<String>) -> String {
+    hosts.iter().cloned().collect::<Vec<_>>().join(", ")
+}
