@@ -9,6 +9,7 @@ pub mod check;
 mod codes;
 mod document;
 mod federation;
+pub mod image;
 mod lets;
 mod manifest;
 mod modes;
