@@ -13,8 +13,7 @@ use crate::commands;
 use crate::error::{CliError, USAGE};
 use crate::ui::Ui;
 
-const EXIT_CODES: &str =
-    "Exit codes: 0 done, 1 failed, 2 `plan`: there are changes, 3 the manifest has mistakes, 4 a host cannot be reached, \
+const EXIT_CODES: &str = "Exit codes: 0 done, 1 failed, 2 `plan`: there are changes, 3 the manifest has mistakes, 4 a host cannot be reached, \
      5 somebody else is at it, 6 not in time, 8 done on some hosts only, 64 wrong usage";
 
 /// Run federations of deterministic reactors from one manifest

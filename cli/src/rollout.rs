@@ -5,9 +5,12 @@ use std::io;
 use std::net::Ipv4Addr;
 use std::path::{Path, PathBuf};
 
+use ictus_deploy::image::elf::Machine;
 use ictus_deploy::placement::{Placement, Way};
-use ictus_deploy::rollout::{Desired, Observed, Plan, ProgramFile, Reason, Refusal, plan, plan_down};
-use ictus_deploy::{Checked, image};
+use ictus_deploy::rollout::{
+    Desired, Observed, Plan, ProgramFile, Reason, Refusal, plan, plan_down,
+};
+use ictus_deploy::{Checked, FederateRun};
 use ictusd::api::StartRequest;
 use ictusd::api::part::{HostRef, Part};
 use ictusd::blobs;
@@ -19,7 +22,7 @@ use crate::session::{Session, request};
 mod execute;
 mod observe;
 
-pub(crate) use execute::{Executor, Verdict};
+pub(crate) use execute::{Executor, size};
 
 /// How long an ordered stop of a federation may take of which no manifest says more, in milliseconds.
 const STOP_LIMIT_MS: u64 = 60_000;
@@ -58,8 +61,7 @@ impl<'a> Rollout<'a> {
             let blobs = host.map(|host| host.blobs.iter().map(|it| it.digest.clone()));
             blobs.into_iter().flatten().collect()
         };
-        let (clients, observed) =
-            observe::all(connected, &desired.federation, &blobs).await;
+        let (clients, observed) = observe::all(connected, &desired.federation, &blobs).await;
         let plan = plan(&desired, &observed).map_err(refused)?;
         Ok(Self {
             checked,
@@ -82,15 +84,19 @@ impl<'a> Rollout<'a> {
         let index = self.placement.hosts.iter().position(|it| it.name == host)?;
         let spec = &self.placement.hosts[index];
         let runs = self.checked.federates.iter().zip(&self.placement.federates);
-        let here: Vec<_> = runs.filter(|(_, at)| **at == index).map(|(run, _)| run).collect();
+        let here: Vec<_> = runs
+            .filter(|(_, at)| **at == index)
+            .map(|(run, _)| run)
+            .collect();
         let sent = |digest: &String| {
             let wanted = self.desired.hosts.get(host);
             wanted.is_some_and(|host| host.blobs.iter().any(|blob| blob.digest == *digest))
         };
-        let program = |run: &&ictus_deploy::FederateRun| {
-            let found = self.files.iter().find(|(digest, file)| {
-                **file == run.executable && sent(digest)
-            })?;
+        let program = |run: &&FederateRun| {
+            let found = self
+                .files
+                .iter()
+                .find(|(digest, file)| **file == run.executable && sent(digest))?;
             Some((run.name.clone(), found.0.clone()))
         };
         let part = Part {
@@ -152,11 +158,11 @@ pub(crate) async fn down(
 fn program_file(path: &Path) -> io::Result<ProgramFile> {
     let bytes = std::fs::metadata(path)?.len();
     let digest = blobs::digest(std::fs::File::open(path)?)?;
-    let arch = image::elf::rust_arch(path).map_err(io::Error::other)?;
+    let machine = Machine::of(path).map_err(io::Error::other)?;
     Ok(ProgramFile {
         digest,
         bytes,
-        arch,
+        arch: machine.architecture.rust_name().to_owned(),
     })
 }
 

@@ -1,8 +1,11 @@
 //! What commands share: the way to the daemon, the checked manifest, which federation is meant.
 
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
+use clap::Args;
+use ictus_deploy::placement::{SshClient, Way};
 use ictus_deploy::{CheckOptions, Checked, Progress, check};
 use ictusd::api::{Failure, FailureKind, FederationView, Outcome, StartRequest};
 use ictusd::client::Client;
@@ -13,6 +16,7 @@ use tokio::runtime::Runtime;
 
 use crate::args::ManifestArgs;
 use crate::error::{CliError, Kind};
+use crate::hosts::{connect_all, others, ways};
 use crate::ui::Ui;
 
 /// A command's connection to this user's daemon.
@@ -81,8 +85,84 @@ impl Session {
 
 const UP: &str = "`ictus up MANIFEST` starts one";
 
-/// The federation's name in a manifest.
-fn name_in(manifest: &Path) -> Result<String, CliError> {
+/// A federation over several hosts that a command means.
+#[derive(Debug)]
+pub(crate) struct Abroad {
+    pub(crate) name: String,
+    pub(crate) ways: BTreeMap<String, Way>,
+}
+
+/// Which federation is meant, and where to look for it.
+#[derive(Clone, Debug, Default, Args)]
+pub(crate) struct Whereabouts {
+    /// A host on which it runs; the others are found from there. May be given several times
+    #[arg(long = "host", value_name = "[USER@]HOST")]
+    pub(crate) hosts: Vec<String>,
+}
+
+impl Whereabouts {
+    /// The hosts that are meant, by `--host` or by a manifest with hosts; absent: this machine.
+    pub(crate) async fn find(
+        &self,
+        session: &Session,
+        given: Option<&str>,
+    ) -> Result<Option<Abroad>, CliError> {
+        if !self.hosts.is_empty() {
+            return self.ask(session, given).await.map(Some);
+        }
+        let manifest = given
+            .map(Path::new)
+            .filter(|path| path.is_file() || path.is_dir());
+        let Some(manifest) = manifest else {
+            return Ok(None);
+        };
+        let checked = unbuilt(manifest)?;
+        let abroad = checked.placement.map(|placement| Abroad {
+            name: checked.plan.federation,
+            ways: ways(&placement),
+        });
+        Ok(abroad)
+    }
+
+    /// Asks the hosts that are given for the others.
+    async fn ask(&self, session: &Session, given: Option<&str>) -> Result<Abroad, CliError> {
+        let given_ways = self.hosts.iter().map(|target| {
+            let way = Way::Ssh {
+                target: target.clone(),
+                client: SshClient::default(),
+                identity: None,
+            };
+            (target.clone(), way)
+        });
+        let given_ways: BTreeMap<String, Way> = given_ways.collect();
+        let mut views = Vec::new();
+        for (_, client) in connect_all(session, &given_ways).await {
+            views.extend(client?.federations().await?);
+        }
+        let known: BTreeSet<&str> = views.iter().map(|view| view.name.as_str()).collect();
+        let known = known.into_iter().collect::<Vec<_>>();
+        let name = match (given, known.as_slice()) {
+            (Some(given), _) if known.contains(&given) => given.to_owned(),
+            (None, [only]) => (*only).to_owned(),
+            (None, [_, _, ..]) => {
+                return Err(CliError::failed("there are several federations: say which")
+                    .hint(format!("known: {}", known.join(", "))));
+            }
+            (Some(given), _) => {
+                let error = CliError::failed(format!("there is no federation `{given}` there"));
+                return Err(error.hint(format!("known: {}", known.join(", "))));
+            }
+            (None, []) => return Err(CliError::failed("there is no federation there")),
+        };
+        let found = others(&views, &name);
+        // One that is whole on its host has no record of others.
+        let ways = if found.is_empty() { given_ways } else { found };
+        Ok(Abroad { name, ways })
+    }
+}
+
+/// A manifest as far as it can be known without building.
+fn unbuilt(manifest: &Path) -> Result<Checked, CliError> {
     let manifest = ManifestArgs {
         manifest: manifest.to_path_buf(),
         set: Vec::new(),
@@ -92,7 +172,12 @@ fn name_in(manifest: &Path) -> Result<String, CliError> {
         build: false,
         ..CheckOptions::default()
     };
-    Ok(check(&manifest, &options, &mut |_| {})?.plan.federation)
+    Ok(check(&manifest, &options, &mut |_| {})?)
+}
+
+/// The federation's name in a manifest.
+fn name_in(manifest: &Path) -> Result<String, CliError> {
+    Ok(unbuilt(manifest)?.plan.federation)
 }
 
 /// Checks a manifest, building its programs, and says so stage by stage.

@@ -53,4 +53,3 @@ async fn relay(daemon: UnixStream) -> std::io::Result<()> {
         received = &mut down => received,
     }
 }
-

@@ -3,11 +3,14 @@
 use std::time::Duration;
 
 use clap::Args;
+use ictus_deploy::placement::Way;
 
 use super::events::describe_outcome;
 use crate::args::duration;
 use crate::error::CliError;
-use crate::session::{Session, within};
+use crate::interrupts::Interrupts;
+use crate::rollout::{self, Executor};
+use crate::session::{Abroad, Session, Whereabouts, within};
 use crate::ui::Ui;
 
 /// Stop a federation and remove all but its logs, which it names
@@ -18,6 +21,8 @@ pub(crate) struct Down {
     /// Remove the logs, too
     #[arg(long)]
     purge: bool,
+    #[command(flatten)]
+    at: Whereabouts,
     /// How long it may take
     #[arg(long, value_name = "TIME", default_value = "1m", value_parser = duration)]
     timeout: Duration,
@@ -26,6 +31,10 @@ pub(crate) struct Down {
 impl Down {
     pub(crate) fn run(&self, ui: &mut Ui) -> Result<(), CliError> {
         let session = Session::new()?;
+        let given = self.name.as_deref();
+        if let Some(abroad) = session.block_on(self.at.find(&session, given))? {
+            return session.block_on(self.everywhere(ui, &session, &abroad));
+        }
         let name = session.name(self.name.as_deref())?;
         session.block_on(async {
             let client = session.daemon().await?;
@@ -47,5 +56,29 @@ impl Down {
             client.end().await?;
             Ok(())
         })
+    }
+
+    /// The same on every host on which it has a part.
+    async fn everywhere(
+        &self,
+        ui: &mut Ui,
+        session: &Session,
+        abroad: &Abroad,
+    ) -> Result<(), CliError> {
+        let mut interrupts = Interrupts::new()?;
+        let (clients, plan) =
+            rollout::down(session, &abroad.name, &abroad.ways, self.purge).await?;
+        let local = abroad.ways.values().any(|way| *way == Way::Local);
+        if plan.steps.is_empty() {
+            ui.message(&plan.to_string());
+        } else {
+            let executor = Executor::down(clients, plan)?;
+            executor.run(ui, &mut interrupts, self.timeout).await?;
+            ui.stage("down", &abroad.name);
+        }
+        if local {
+            session.daemon().await?.end().await?;
+        }
+        Ok(())
     }
 }

@@ -4,7 +4,9 @@ use clap::Args;
 use ictusd::api::LogLine;
 
 use crate::error::CliError;
-use crate::session::Session;
+use crate::hosts::connect_all;
+use crate::hosts::merge::Merged;
+use crate::session::{Abroad, Session, Whereabouts};
 use crate::ui::Ui;
 
 /// Show what federates have written, merged by time
@@ -19,11 +21,17 @@ pub(crate) struct Logs {
     /// The federation (its name or manifest; may be left out when there is one), then federates
     #[arg(value_name = "NAME] [FEDERATE")]
     names: Vec<String>,
+    #[command(flatten)]
+    at: Whereabouts,
 }
 
 impl Logs {
     pub(crate) fn run(&self, ui: &mut Ui) -> Result<(), CliError> {
         let session = Session::new()?;
+        let first = self.names.first().map(String::as_str);
+        if let Some(abroad) = session.block_on(self.at.find(&session, first))? {
+            return session.block_on(self.everywhere(ui, &session, &abroad));
+        }
         let (name, federates) = self.split(&session)?;
         session.block_on(async {
             let client = session.daemon().await?;
@@ -36,6 +44,46 @@ impl Logs {
             }
             Ok(())
         })
+    }
+
+    /// Those of all hosts: what is there by time, what comes as it comes.
+    async fn everywhere(
+        &self,
+        ui: &mut Ui,
+        session: &Session,
+        abroad: &Abroad,
+    ) -> Result<(), CliError> {
+        let wanted = self.names.get(1..).unwrap_or_default();
+        let (mut merged, mut kept) = (Merged::new(), Vec::new());
+        for (host, client) in connect_all(session, &abroad.ways).await {
+            let client = client?;
+            let view = client.federation(&abroad.name).await?;
+            let members = [&view.rti].into_iter().chain(&view.federates);
+            let here: Vec<_> = members.map(|it| it.name.clone()).collect();
+            let wanted_here: Vec<_> = wanted
+                .iter()
+                .filter(|it| here.contains(it))
+                .cloned()
+                .collect();
+            if !wanted.is_empty() && wanted_here.is_empty() {
+                continue;
+            }
+            let lines = client.logs(&abroad.name, &wanted_here, self.follow, self.tail);
+            merged.add(host, lines.await?);
+        }
+        let mut printer = Printer::default();
+        while let Some((_, line)) = merged.next().await {
+            if self.follow {
+                printer.print(ui, &line?)?;
+            } else {
+                kept.push(line?);
+            }
+        }
+        kept.sort();
+        for line in kept {
+            printer.print(ui, &line)?;
+        }
+        Ok(())
     }
 
     /// The first name is a federation's, unless there is only one and it is not called so.

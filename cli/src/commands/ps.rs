@@ -5,8 +5,9 @@ use std::time::Duration;
 use clap::Args;
 use ictusd::api::{FederationView, MemberView, Outcome, State};
 
-use crate::error::CliError;
-use crate::session::{Session, ago};
+use crate::error::{CliError, Kind};
+use crate::hosts::connect_all;
+use crate::session::{Abroad, Session, Whereabouts, ago};
 use crate::ui::{Table, Ui, nanoseconds, one_line};
 
 /// How often `--watch` looks.
@@ -18,18 +19,28 @@ pub(crate) struct Ps {
     /// Show it again every second, until Ctrl-C
     #[arg(short, long)]
     watch: bool,
+    /// Only this federation: its manifest, or with `--host` its name
+    name: Option<String>,
+    #[command(flatten)]
+    at: Whereabouts,
 }
 
 impl Ps {
     pub(crate) fn run(&self, ui: &mut Ui) -> Result<(), CliError> {
         let session = Session::new()?;
+        let given = self.name.as_deref();
+        if let Some(abroad) = session.block_on(self.at.find(&session, given))? {
+            return session.block_on(self.everywhere(ui, &session, &abroad));
+        }
+        let only = given.map(|given| session.name(Some(given))).transpose()?;
         if !self.watch && session.known().is_empty() {
             return show(ui, &[]);
         }
         session.block_on(async {
             let client = session.daemon().await?;
             loop {
-                let views = client.federations().await?;
+                let mut views = client.federations().await?;
+                views.retain(|view| only.as_ref().is_none_or(|only| *only == view.name));
                 if self.watch && ui.can_redraw() {
                     ui.clear()?;
                 }
@@ -40,6 +51,45 @@ impl Ps {
                 tokio::time::sleep(PERIOD).await;
             }
         })
+    }
+
+    /// The parts of a federation on its hosts.
+    async fn everywhere(
+        &self,
+        ui: &mut Ui,
+        session: &Session,
+        abroad: &Abroad,
+    ) -> Result<(), CliError> {
+        let connected = connect_all(session, &abroad.ways).await;
+        loop {
+            let (mut views, mut silent) = (Vec::new(), Vec::new());
+            for (host, client) in &connected {
+                match client {
+                    Ok(client) => match client.federations().await {
+                        Ok(found) => {
+                            views.extend(found.into_iter().filter(|it| it.name == abroad.name));
+                        }
+                        Err(error) => silent.push((host, CliError::from(error).to_string())),
+                    },
+                    Err(error) => silent.push((host, error.to_string())),
+                }
+            }
+            if self.watch && ui.can_redraw() {
+                ui.clear()?;
+            }
+            show(ui, &views)?;
+            // What cannot be asked is unknown, and nothing else.
+            for (host, why) in &silent {
+                ui.warning(&format!("{host}: unknown: {why}"));
+            }
+            if !self.watch {
+                let error = silent.into_iter().next();
+                return error.map_or(Ok(()), |(_, why)| {
+                    Err(CliError::new(Kind::Unreachable, why))
+                });
+            }
+            tokio::time::sleep(PERIOD).await;
+        }
     }
 }
 
@@ -61,8 +111,14 @@ fn show(ui: &mut Ui, views: &[FederationView]) -> Result<(), CliError> {
         ];
         let mut table = Table::new(&head);
         for view in views {
-            table.row([view.name.clone(), "-".to_owned(), state(view)]);
-            for member in [&view.rti].into_iter().chain(&view.federates) {
+            let part = view.part.as_ref();
+            let name = part.map_or_else(
+                || view.name.clone(),
+                |part| format!("{} on {}", view.name, part.host),
+            );
+            table.row([name, "-".to_owned(), state(view)]);
+            let rti = part.is_none_or(|part| part.rti).then_some(&view.rti);
+            for member in rti.into_iter().chain(&view.federates) {
                 table.row(row(member));
             }
         }

@@ -3,6 +3,7 @@
 use std::time::{Duration, Instant};
 
 use clap::Args;
+use ictus_deploy::{Checked, Placement};
 use ictusd::api::{ErrorCode, Event, Happening, Outcome};
 use ictusd::client::{Client, ClientError, Stream, is_already_running};
 use ictusd::stamp;
@@ -12,6 +13,7 @@ use super::logs;
 use crate::args::{ManifestArgs, duration};
 use crate::error::{CliError, Kind};
 use crate::interrupts::Interrupts;
+use crate::rollout::{Executor, Rollout, size};
 use crate::session::{Session, checked, count, request, succeed};
 use crate::ui::Ui;
 
@@ -61,6 +63,9 @@ impl Up {
     pub(crate) fn run(&self, ui: &mut Ui) -> Result<(), CliError> {
         let session = Session::new()?;
         let checked = checked(ui, &self.manifest, true)?;
+        if let Some(placement) = &checked.placement {
+            return session.block_on(self.roll_out(ui, &session, (&checked, placement)));
+        }
         let request = request(&checked, self.trace);
         let name = checked.plan.federation.clone();
         session.block_on(async {
@@ -102,6 +107,49 @@ impl Up {
             } else {
                 said
             }
+        })
+    }
+
+    /// The same over the manifest's hosts.
+    async fn roll_out(
+        &self,
+        ui: &mut Ui,
+        session: &Session,
+        (checked, placement): (&Checked, &Placement),
+    ) -> Result<(), CliError> {
+        if self.attach {
+            let message = "`--attach` is for federations of this machine";
+            return Err(CliError::failed(message).hint("`ictus logs -f` shows what they say"));
+        }
+        let since = Instant::now();
+        let mut interrupts = Interrupts::new()?;
+        let rollout = Rollout::new(session, checked, placement, self.trace).await?;
+        let name = &checked.plan.federation;
+        if rollout.is_done() {
+            ui.message(&format!("{name} is already running from the same manifest"));
+        } else {
+            ui.stage(
+                "planned",
+                rollout.plan.to_string().lines().next().unwrap_or(name),
+            );
+            let executor = Executor::up(rollout)?;
+            let verdict = executor.run(ui, &mut interrupts, self.timeout).await?;
+            let mut detail = format!("after {:.1} s", since.elapsed().as_secs_f64());
+            if let Some(commit) = verdict.commit {
+                detail.push_str(&format!(", {:.1} s from commit", commit.as_secs_f64()));
+            }
+            detail.push_str(&format!(", {} sent", size(verdict.sent)));
+            ui.stage("healthy", &detail);
+        }
+        let hosts = placement.hosts.iter().map(|host| host.name.clone());
+        let hosts: Vec<_> = hosts.collect();
+        let manifest = self.manifest.manifest.display();
+        ui.result(&serde_json::json!({ "federation": name, "hosts": hosts }), || {
+            let federates = count(checked.federates.len(), "federate");
+            format!(
+                "{name} runs: {federates} on {}\n  ictus ps {manifest}\n  ictus logs -f {manifest}\n  ictus down {manifest}",
+                hosts.join(", ")
+            )
         })
     }
 

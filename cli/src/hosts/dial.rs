@@ -37,7 +37,8 @@ impl fmt::Debug for Host {
 
 /// A target as a person writes it.
 pub(crate) fn target(text: &str) -> Result<Target, CliError> {
-    text.parse().map_err(|error: SshError| CliError::failed(error))
+    text.parse()
+        .map_err(|error: SshError| CliError::failed(error))
 }
 
 /// Usual places, and who speaks ssh.
@@ -113,14 +114,16 @@ impl Host {
         match tokio::time::timeout(GREETING_MAX, greeting).await {
             Ok(Ok(())) => Ok(Box::new(channel)),
             Ok(Err(error)) if error.kind() == io::ErrorKind::UnexpectedEof => {
-                let what = format!(
-                    "no ictusd answers there; `ictus host add` puts it at ~/{INSTALLED}"
-                );
+                let what =
+                    format!("no ictusd answers there; `ictus host add` puts it at ~/{INSTALLED}");
                 Err(io::Error::new(io::ErrorKind::NotFound, what))
             }
             Ok(Err(error)) => Err(error),
             Err(_) => {
-                let what = format!("its ictusd did not answer within {} s", GREETING_MAX.as_secs());
+                let what = format!(
+                    "its ictusd did not answer within {} s",
+                    GREETING_MAX.as_secs()
+                );
                 Err(io::Error::new(io::ErrorKind::TimedOut, what))
             }
         }

@@ -53,6 +53,11 @@ impl<T: DeserializeOwned + Send + 'static> Merged<T> {
         });
     }
 
+    /// Whether any stream has not ended.
+    pub(crate) fn has_open(&self) -> bool {
+        self.open > 0
+    }
+
     /// The next value of any of them; absent when all have ended.
     pub(crate) async fn next(&mut self) -> Option<(String, Result<T, ClientError>)> {
         loop {

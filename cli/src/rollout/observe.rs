@@ -56,8 +56,13 @@ async fn one(
         docker: facts.docker.map(drop),
         realtime: facts.realtime,
         disk_free: facts.disk_free,
-        blobs: blobs.into_iter().filter(|it| !missing.contains(it)).collect(),
-        run: view(client, federation).await?.map_or(Ok(None), |view| run(&view).map(Some)),
+        blobs: blobs
+            .into_iter()
+            .filter(|it| !missing.contains(it))
+            .collect(),
+        run: view(client, federation)
+            .await?
+            .map_or(Ok(None), |view| run(&view).map(Some)),
         lease: lease.map(|lease| Held {
             who: lease.who,
             left_ms: lease.left_ms,
@@ -93,7 +98,9 @@ fn run(view: &FederationView) -> Result<Run, NewerRecord> {
         });
     }
     let part = view.part.as_ref();
-    let rti = [&view.rti].into_iter().filter(|_| part.is_none_or(|part| part.rti));
+    let rti = [&view.rti]
+        .into_iter()
+        .filter(|_| part.is_none_or(|part| part.rti));
     let members = rti.chain(&view.federates).filter(|it| !it.name.is_empty());
     Ok(Run {
         id: view.id.clone(),
@@ -101,7 +108,9 @@ fn run(view: &FederationView) -> Result<Run, NewerRecord> {
         facets: view.facets.clone(),
         state: state(view),
         members: members.map(|it| (it.name.clone(), member(it))).collect(),
-        hosts: part.map(|part| part.hosts.keys().cloned().collect()).unwrap_or_default(),
+        hosts: part
+            .map(|part| part.hosts.keys().cloned().collect())
+            .unwrap_or_default(),
     })
 }
 

@@ -194,6 +194,12 @@ impl Architecture {
             .map(|names| names.0)
     }
 
+    /// Rust's name of it: `x86_64`, `aarch64`.
+    #[must_use]
+    pub fn rust_name(self) -> &'static str {
+        self.names().2
+    }
+
     /// The target that cargo builds for it.
     #[must_use]
     pub fn target(self) -> &'static str {
