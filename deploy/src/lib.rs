@@ -24,6 +24,8 @@ mod quantity;
 mod reactions;
 pub mod rollout;
 mod spans;
+#[cfg(feature = "ssh")]
+pub mod ssh;
 mod structure;
 mod suggest;
 pub mod timing;

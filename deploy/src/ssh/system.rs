@@ -1,0 +1,377 @@
+//! The system's `ssh` as the way to a host: for what libssh2 lacks (FIDO keys, certificates, patterns, `Match`).
+
+use std::collections::VecDeque;
+use std::io::ErrorKind;
+use std::path::PathBuf;
+use std::process::Stdio;
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Duration;
+
+use tokio::io::{AsyncRead, AsyncReadExt as _};
+use tokio::process::{Child, ChildStdin, ChildStdout, Command};
+use tokio::sync::OwnedSemaphorePermit;
+use tokio::task::JoinHandle;
+use tokio::time::timeout;
+
+use super::Options;
+use super::error::SshError;
+use super::known_hosts::{Known, fingerprint_at};
+use super::pipe::{End, STDERR_MAX};
+use super::route::{Route, jumps};
+use super::target::Target;
+
+/// What `ssh` exits with when it failed itself.
+const OWN_FAILURE: i32 = 255;
+/// How long a program that has ended may hold its standard error open through others.
+const STDERR_LINGER: Duration = Duration::from_secs(1);
+
+/// The system's client for one host.
+#[derive(Clone, Debug)]
+pub(super) struct System {
+    target: Target,
+    options: Options,
+    route: Route,
+}
+
+/// A running `ssh`.
+#[derive(Debug)]
+pub(super) struct Process {
+    pub(super) stdin: Option<ChildStdin>,
+    pub(super) stdout: ChildStdout,
+    stderr: Arc<Mutex<VecDeque<u8>>>,
+    reader: JoinHandle<()>,
+    child: Child,
+    system: Arc<System>,
+    _permit: OwnedSemaphorePermit,
+}
+
+impl System {
+    /// Asks `ssh -G` what it would do, without connecting.
+    pub(super) async fn new(target: &Target, options: &Options) -> Result<Self, SshError> {
+        let mut command = base(target, options);
+        command
+            .args(["-G", "--", &target.host])
+            .stdin(Stdio::null());
+        let output = match timeout(options.connect_timeout, command.output()).await {
+            Ok(Ok(output)) => output,
+            Ok(Err(error)) => return Err(missing(&error)),
+            Err(_) => {
+                return Err(SshError::Timeout {
+                    host: target.to_string(),
+                    doing: "asking `ssh -G`".to_owned(),
+                    seconds: options.connect_timeout.as_secs(),
+                });
+            }
+        };
+        if !output.status.success() {
+            return Err(SshError::Config {
+                file: options
+                    .config
+                    .clone()
+                    .unwrap_or_else(|| PathBuf::from("ssh_config")),
+                line: 0,
+                what: last_lines(&output.stderr),
+            });
+        }
+        let route = route(target, options, &String::from_utf8_lossy(&output.stdout))?;
+        Ok(Self {
+            target: target.clone(),
+            options: options.clone(),
+            route,
+        })
+    }
+
+    pub(super) fn route(&self) -> &Route {
+        &self.route
+    }
+
+    /// Starts a command line that was validated.
+    pub(super) fn start(
+        self: &Arc<Self>,
+        line: &str,
+        permit: OwnedSemaphorePermit,
+    ) -> Result<Process, SshError> {
+        let mut command = base(&self.target, &self.options);
+        command
+            .args(["-T", "--", &self.target.host])
+            .args(line.split(' '));
+        command.stdin(Stdio::piped());
+        let mut child = command.spawn().map_err(|error| missing(&error))?;
+        let (Some(stdout), Some(stderr)) = (child.stdout.take(), child.stderr.take()) else {
+            return Err(missing(&ErrorKind::BrokenPipe.into()));
+        };
+        let tail = Arc::new(Mutex::new(VecDeque::new()));
+        let reader = tokio::spawn(keep_tail(stderr, Arc::clone(&tail)));
+        Ok(Process {
+            stdin: child.stdin.take(),
+            stdout,
+            stderr: tail,
+            reader,
+            child,
+            system: Arc::clone(self),
+            _permit: permit,
+        })
+    }
+
+    /// What `ssh` itself failed at, from what it printed; none when the command's own exit code was 255.
+    fn classify(&self, text: &str) -> Option<SshError> {
+        let host = self.route.name();
+        let line_with = |part: &str| {
+            text.lines()
+                .find(|line| line.contains(part))
+                .map(|line| line.trim().to_owned())
+        };
+        let any = |parts: &[&str]| parts.iter().find_map(|part| line_with(part));
+        if text.contains("REVOKED HOST KEY") || text.contains("is marked as revoked") {
+            return Some(self.revoked());
+        }
+        if text.contains("REMOTE HOST IDENTIFICATION HAS CHANGED") {
+            return Some(self.changed(text));
+        }
+        if let Some(line) = any(&["host key is known for", "Host key verification failed"]) {
+            return Some(SshError::UnknownHostKey {
+                host,
+                kind: line
+                    .split(' ')
+                    .nth(1)
+                    .filter(|_| line.starts_with("No "))
+                    .unwrap_or_default()
+                    .to_owned(),
+                fingerprint: "that ssh does not print".to_owned(),
+                known_hosts: self
+                    .route
+                    .known_hosts
+                    .first()
+                    .map_or_else(String::new, |file| file.display().to_string()),
+            });
+        }
+        if let Some(line) = any(&["Permission denied (", "Too many authentication failures"]) {
+            return Some(SshError::Auth {
+                host,
+                user: self.route.user.clone(),
+                tried: format!("what the system's ssh tries: {line}"),
+            });
+        }
+        if any(&["Connection timed out", "Operation timed out"]).is_some() {
+            return Some(SshError::Timeout {
+                host,
+                doing: "connecting".to_owned(),
+                seconds: self.options.connect_timeout.as_secs(),
+            });
+        }
+        let unreachable = [
+            "Could not resolve hostname",
+            "Connection refused",
+            "No route to host",
+            "Network is unreachable",
+        ];
+        if let Some(cause) = any(&unreachable) {
+            return Some(SshError::Unreachable { host, cause });
+        }
+        let closed = [
+            "Connection closed by",
+            "Connection reset by",
+            "kex_exchange_identification",
+            "not responding",
+            "Broken pipe",
+            "disconnect",
+        ];
+        if let Some(cause) = any(&closed) {
+            return Some(SshError::Closed { host, cause });
+        }
+        let refused = [
+            "Unable to negotiate",
+            "channel 0: open failed",
+            "exec request failed",
+        ];
+        any(&refused).map(|cause| SshError::Refused {
+            host,
+            what: "the system's ssh".to_owned(),
+            cause,
+        })
+    }
+
+    fn revoked(&self) -> SshError {
+        let known = Known::read(&self.route.known_hosts, &self.route.host, self.route.port)
+            .unwrap_or_default();
+        let (file, line, fingerprint) = known.first_revoked().unwrap_or_default();
+        SshError::Revoked {
+            host: self.route.name(),
+            file,
+            line,
+            fingerprint,
+        }
+    }
+
+    /// `Offending ED25519 key in FILE:LINE` and the fingerprint that follows `sent by the remote host is`.
+    fn changed(&self, text: &str) -> SshError {
+        let place = text
+            .lines()
+            .find(|line| line.starts_with("Offending "))
+            .and_then(|line| {
+                let (file, line) = line.split_once(" key in ")?.1.rsplit_once(':')?;
+                Some((PathBuf::from(file), line.trim().parse().ok()?))
+            });
+        let (file, line) = place.unwrap_or_default();
+        let found = text
+            .split_whitespace()
+            .find(|word| word.starts_with("SHA256:"))
+            .unwrap_or_default();
+        SshError::HostKeyChanged {
+            host: self.route.name(),
+            expected: fingerprint_at(&file, line).unwrap_or_default(),
+            file,
+            line,
+            found: found.trim_end_matches('.').to_owned(),
+        }
+    }
+}
+
+impl Process {
+    /// Waits until `ssh` has ended.
+    pub(super) async fn end(&mut self) -> Result<End, SshError> {
+        self.stdin = None;
+        let status = self.child.wait().await.map_err(|error| missing(&error))?;
+        // A connection that is shared may hold the pipe: what is there by then is enough.
+        let whole = timeout(STDERR_LINGER, &mut self.reader).await.is_ok();
+        if !whole {
+            self.reader.abort();
+        }
+        let stderr: Vec<u8> = tail(&self.stderr).iter().copied().collect();
+        if status.code() == Some(OWN_FAILURE)
+            && let Some(error) = self.system.classify(&String::from_utf8_lossy(&stderr))
+        {
+            return Err(error);
+        }
+        Ok(End {
+            code: status.code(),
+            signal: status.code().is_none().then(|| "of its own ssh".to_owned()),
+            stderr,
+        })
+    }
+}
+
+/// `ssh` with everything that makes it ask nothing and trust nothing new.
+fn base(target: &Target, options: &Options) -> Command {
+    let mut command = Command::new("ssh");
+    let default = options.home.as_ref().map(|home| home.join(".ssh/config"));
+    match &options.config {
+        // Its own default also reads /etc/ssh/ssh_config.
+        Some(file) if Some(file) == default.as_ref() => {}
+        Some(file) if file.exists() => {
+            command.arg("-F").arg(file);
+        }
+        Some(_) | None => {
+            command.args(["-F", "none"]);
+        }
+    }
+    for option in [
+        "BatchMode=yes",
+        "StrictHostKeyChecking=yes",
+        "UpdateHostKeys=no",
+        "ControlMaster=no",
+        "ClearAllForwardings=yes",
+        "RequestTTY=no",
+        "RemoteCommand=none",
+        "PermitLocalCommand=no",
+        "ServerAliveInterval=10",
+        "ServerAliveCountMax=3",
+    ] {
+        command.args(["-o", option]);
+    }
+    let seconds = options.connect_timeout.as_secs().max(1);
+    command.arg("-o").arg(format!("ConnectTimeout={seconds}"));
+    command.arg("-o").arg(format!(
+        "UserKnownHostsFile=\"{}\"",
+        options.known_hosts.display()
+    ));
+    match &options.agent {
+        Some(agent) => command.env("SSH_AUTH_SOCK", agent),
+        None => command.env_remove("SSH_AUTH_SOCK"),
+    };
+    if let Some(identity) = &options.identity {
+        command
+            .arg("-o")
+            .arg("IdentitiesOnly=yes")
+            .arg("-i")
+            .arg(identity);
+    }
+    if let Some(user) = &target.user {
+        command.arg("-l").arg(user);
+    }
+    if let Some(port) = target.port {
+        command.arg("-p").arg(port.to_string());
+    }
+    command.env("LC_ALL", "C").env_remove("SSH_ASKPASS");
+    command
+        .stdout(Stdio::piped())
+        .stderr(Stdio::piped())
+        .kill_on_drop(true);
+    command
+}
+
+/// What `ssh -G` printed, as a route.
+fn route(target: &Target, options: &Options, text: &str) -> Result<Route, SshError> {
+    let value = |keyword: &str| {
+        text.lines().find_map(|line| {
+            line.strip_prefix(keyword)?
+                .strip_prefix(' ')
+                .map(str::to_owned)
+        })
+    };
+    let bad = |what: &str| SshError::Config {
+        file: PathBuf::from("ssh -G"),
+        line: 0,
+        what: format!("what it prints for `{target}` has no {what}; is `ssh` OpenSSH's?"),
+    };
+    Ok(Route {
+        host: value("hostname").ok_or_else(|| bad("hostname"))?,
+        port: value("port")
+            .and_then(|port| port.parse().ok())
+            .ok_or_else(|| bad("port"))?,
+        user: value("user").ok_or_else(|| bad("user"))?,
+        identities: Vec::new(),
+        identities_named: false,
+        only_identities: false,
+        agent: options.agent.clone(),
+        known_hosts: vec![options.known_hosts.clone()],
+        jumps: jumps(value("proxyjump").as_deref())
+            .map_err(|_| bad("jump host that we understand"))?,
+    })
+}
+
+/// Keeps the last bytes of a stream.
+async fn keep_tail(mut stream: impl AsyncRead + Unpin, kept: Arc<Mutex<VecDeque<u8>>>) {
+    let mut chunk = vec![0; 8 << 10];
+    while let Ok(count @ 1..) = stream.read(&mut chunk).await {
+        let mut kept = tail(&kept);
+        kept.extend(&chunk[..count]);
+        let over = kept.len().saturating_sub(STDERR_MAX);
+        kept.drain(..over);
+    }
+}
+
+fn tail(kept: &Mutex<VecDeque<u8>>) -> std::sync::MutexGuard<'_, VecDeque<u8>> {
+    kept.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+fn missing(error: &std::io::Error) -> SshError {
+    SshError::Local {
+        what: "cannot run the system's `ssh`".to_owned(),
+        cause: match error.kind() {
+            ErrorKind::NotFound => "it is not installed: `sudo apt-get install openssh-client`, or leave `client: system` out".to_owned(),
+            _ => error.to_string(),
+        },
+    }
+}
+
+/// The last three lines of what a program said, in one.
+pub(super) fn last_lines(stderr: &[u8]) -> String {
+    let text = String::from_utf8_lossy(stderr);
+    let lines: Vec<&str> = text
+        .lines()
+        .map(str::trim)
+        .filter(|line| !line.is_empty())
+        .collect();
+    lines[lines.len().saturating_sub(3)..].join("; ")
+}
