@@ -64,6 +64,8 @@ enum Command {
     Stop(commands::stop::Stop),
     Down(commands::down::Down),
     Verify(commands::verify::Verify),
+    Host(commands::host::Host),
+    Lock(commands::lock::Lock),
     /// Measure throughput and latency beside the floors of this machine
     Bench(PassedOn),
     /// Print the manifest's JSON Schema
@@ -145,6 +147,8 @@ fn run(cli: Cli) -> ExitCode {
         Command::Stop(it) => it.run(&mut ui),
         Command::Down(it) => it.run(&mut ui),
         Command::Verify(it) => it.run(&mut ui),
+        Command::Host(it) => it.run(&mut ui),
+        Command::Lock(it) => it.run(&mut ui),
         Command::Bench(it) => commands::bench::run(&it.args),
         Command::Schema => commands::schema::run(&mut ui),
         Command::Explain(it) => it.run(&mut ui),

@@ -13,7 +13,7 @@ use crate::session::Session;
 mod dial;
 pub(crate) mod merge;
 
-pub(crate) use dial::{options, target};
+pub(crate) use dial::{options, target, unreachable_host};
 
 /// Where `ictus host add` puts the program, from the user's home.
 pub(crate) const INSTALLED: &str = ".local/share/ictus/bin/ictusd";

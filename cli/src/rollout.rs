@@ -22,7 +22,7 @@ use crate::session::{Session, request};
 mod execute;
 mod observe;
 
-pub(crate) use execute::{Executor, size};
+pub(crate) use execute::{Executor, size, who};
 
 /// How long an ordered stop of a federation may take of which no manifest says more, in milliseconds.
 const STOP_LIMIT_MS: u64 = 60_000;

@@ -122,7 +122,7 @@ impl Ui {
 
     /// Says why a command failed and gives its exit code.
     pub(crate) fn fail(&mut self, error: &CliError) -> ExitCode {
-        if error.kind != Kind::BrokenPipe {
+        if !matches!(error.kind, Kind::BrokenPipe | Kind::Changes) {
             let label = self.paint("error:", "31");
             self.err(&format!("{label} {error}"), true);
             for hint in &error.hints {

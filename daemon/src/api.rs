@@ -12,6 +12,7 @@
 //! | `GET /v1/events?follow=BOOL&federation=NAME` | a stream of [`Happening`] |
 //! | `GET /metrics` | all federations as Prometheus reads it; with `metrics.listen` also over TCP, with `GET /healthz` |
 //! | `POST /v1/end` | ends the daemon if it owns nothing |
+//! | `POST /v1/give-way` | ends the daemon whatever it owns: federations go on, and the next daemon takes them over |
 //!
 //! Errors are [`ApiError`] with a status of 400 and up.
 

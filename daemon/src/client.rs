@@ -328,12 +328,32 @@ impl Client {
     /// # Errors
     /// See [`ClientError`].
     pub async fn end(&self) -> Result<bool, ClientError> {
-        let pidfd = process::open(self.info().await?.pid);
+        let pid = self.info().await?.pid;
+        // Of another host's daemon only the answer can be waited for.
+        let local = matches!(self.way, Way::Socket(_));
+        let pidfd = local.then(|| process::open(pid)).flatten();
         let idle = self.answer(Method::POST, "/v1/end", Bytes::new()).await?;
         if let (true, Some(pidfd)) = (idle, pidfd) {
             process::wait_for_end(pidfd, END_MAX).await;
         }
         Ok(idle)
+    }
+
+    /// Has the daemon end, whatever it owns: another one takes over.
+    ///
+    /// # Errors
+    /// See [`ClientError`].
+    pub async fn give_way(&self) -> Result<(), ClientError> {
+        let pid = self.info().await?.pid;
+        let local = matches!(self.way, Way::Socket(_));
+        let pidfd = local.then(|| process::open(pid)).flatten();
+        let _: bool = self
+            .answer(Method::POST, "/v1/give-way", Bytes::new())
+            .await?;
+        if let Some(pidfd) = pidfd {
+            process::wait_for_end(pidfd, END_MAX).await;
+        }
+        Ok(())
     }
 
     async fn answer<T: DeserializeOwned>(

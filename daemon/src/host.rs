@@ -275,6 +275,11 @@ impl Host {
         idle
     }
 
+    /// Ends the daemon, and nothing else.
+    pub(crate) fn end(&self) {
+        self.0.end.send_replace(true);
+    }
+
     /// Waits until [`Host::end_if_idle`] has succeeded.
     pub(crate) async fn ended(&self) {
         let mut end = self.0.end.subscribe();

@@ -56,6 +56,7 @@ pub(crate) fn router(host: Host) -> Router {
         .route("/v1/federations/{name}/measures", get(measures))
         .route("/v1/events", get(events))
         .route("/v1/end", post(end))
+        .route("/v1/give-way", post(give_way))
         .route("/metrics", get(metrics))
         .merge(parts::router())
         .fallback(async || bad_request("no such call; is the daemon of another version?"))
@@ -336,6 +337,11 @@ async fn events(
 
 async fn end(State(host): State<Host>) -> Json<bool> {
     Json(host.end_if_idle())
+}
+
+async fn give_way(State(host): State<Host>) -> Json<bool> {
+    host.end();
+    Json(true)
 }
 
 /// Passes a federation's events on until its end, or until nobody listens.

@@ -1,8 +1,9 @@
 //! `ictusd dial-stdio`: standard input and output become a connection to this user's daemon. What ssh runs.
 
-use ictusd::paths::Paths;
-use tokio::io::{AsyncReadExt, AsyncWriteExt};
-use tokio::net::UnixStream;
+use std::io::{self, Read, Write};
+use std::net::Shutdown;
+use std::os::unix::net::UnixStream;
+use std::thread;
 
 use crate::error::CliError;
 use crate::session::Session;
@@ -13,43 +14,44 @@ pub(crate) const MAGIC: &str = "ictus-dial-stdio-1";
 /// Takes no address: it connects to this user's daemon and to nothing else.
 pub(crate) fn run() -> Result<(), CliError> {
     let session = Session::new()?;
-    session.block_on(async {
-        let paths = Paths::from_env()?;
-        session.daemon().await?;
-        let socket = paths.socket_in_lock().unwrap_or_else(|| paths.socket());
-        let daemon = UnixStream::connect(&socket)
-            .await
-            .map_err(CliError::failed)?;
-        relay(daemon).await.map_err(CliError::failed)
-    })
+    session.block_on(session.daemon())?;
+    let socket = session.paths.socket_in_lock();
+    let socket = socket.unwrap_or_else(|| session.paths.socket());
+    let daemon = UnixStream::connect(&socket).map_err(CliError::failed)?;
+    relay(daemon).map_err(CliError::failed)
 }
 
-/// Copies both ways; the end of either direction is passed on.
-async fn relay(daemon: UnixStream) -> std::io::Result<()> {
-    let (mut input, mut output) = (tokio::io::stdin(), tokio::io::stdout());
-    output.write_all(format!("{MAGIC}\n").as_bytes()).await?;
-    output.flush().await?;
-    let (mut from_daemon, mut to_daemon) = daemon.into_split();
-    let up = async {
-        tokio::io::copy(&mut input, &mut to_daemon).await?;
-        to_daemon.shutdown().await
-    };
-    let down = async {
-        let mut buffer = vec![0; 64 << 10];
-        loop {
-            let count = from_daemon.read(&mut buffer).await?;
-            if count == 0 {
-                return output.shutdown().await;
+/// Copies both ways until the daemon has said everything; the end of what comes in is passed on.
+fn relay(daemon: UnixStream) -> io::Result<()> {
+    let mut out = io::stdout().lock();
+    writeln!(out, "{MAGIC}")?;
+    out.flush()?;
+    let (mut from, mut to) = (daemon.try_clone()?, daemon);
+    // Not waited for: it may stand in a read when all is said, and ends with the process.
+    thread::spawn(move || {
+        let mut input = io::stdin().lock();
+        pass(&mut input, &mut to).ok();
+        to.shutdown(Shutdown::Write).ok();
+    });
+    match pass(&mut from, &mut out) {
+        // Nobody reads any more.
+        Err(error) if error.kind() == io::ErrorKind::BrokenPipe => Ok(()),
+        other => other,
+    }
+}
+
+/// Copies, and lets nothing wait: events are small.
+fn pass(from: &mut impl Read, to: &mut impl Write) -> io::Result<()> {
+    let mut buffer = vec![0; 64 << 10];
+    loop {
+        match from.read(&mut buffer) {
+            Ok(0) => return Ok(()),
+            Ok(count) => {
+                to.write_all(&buffer[..count])?;
+                to.flush()?;
             }
-            output.write_all(&buffer[..count]).await?;
-            // Events are small, and nobody wants to wait for the next one.
-            output.flush().await?;
+            Err(error) if error.kind() == io::ErrorKind::Interrupted => {}
+            Err(error) => return Err(error),
         }
-    };
-    tokio::pin!(up, down);
-    tokio::select! {
-        // Nothing comes any more; an answer still may.
-        sent = &mut up => { sent?; down.await }
-        received = &mut down => received,
     }
 }

@@ -9,8 +9,9 @@ use ictus_deploy::{Checked, Offsets};
 use serde::Serialize;
 
 use crate::args::ManifestArgs;
-use crate::error::CliError;
-use crate::session::checked;
+use crate::error::{CliError, Kind};
+use crate::rollout::Rollout;
+use crate::session::{Session, checked};
 use crate::ui::{Table, Ui, nanoseconds};
 
 /// Show what a manifest runs: federates, connections, and every federate's STP offset with its terms
@@ -44,7 +45,20 @@ impl PlanCommand {
                 .map(|run| (run.name.as_str(), run.executable.as_path()))
                 .collect(),
         };
-        ui.result(&answer, || text(&checked))
+        let hosts = checked.placement.as_ref().filter(|_| !self.no_build);
+        let Some(placement) = hosts else {
+            return ui.result(&answer, || text(&checked));
+        };
+        let session = Session::new()?;
+        let rollout = Rollout::new(&session, &checked, placement, false);
+        let plan = session.block_on(rollout)?.plan;
+        let answer = serde_json::json!({ "federation": answer, "rollout": plan });
+        ui.result(&answer, || format!("{}\n\n{plan}", text(&checked)))?;
+        if plan.is_empty() {
+            Ok(())
+        } else {
+            Err(CliError::new(Kind::Changes, "there are changes"))
+        }
     }
 }
 

@@ -2,7 +2,7 @@
 
 use std::fmt;
 use std::io;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::pin::Pin;
 use std::sync::Arc;
 use std::time::Duration;
@@ -16,8 +16,6 @@ use super::INSTALLED;
 use crate::commands::dial_stdio::MAGIC;
 use crate::error::{CliError, Kind};
 
-/// How long a host may take to answer at all.
-const CONNECT_MAX: Duration = Duration::from_secs(10);
 /// How long its daemon may take to be found or started.
 const GREETING_MAX: Duration = Duration::from_secs(20);
 /// Bytes of a shell's banner that are passed over.
@@ -43,18 +41,13 @@ pub(crate) fn target(text: &str) -> Result<Target, CliError> {
 
 /// Usual places, and who speaks ssh.
 pub(crate) fn options(client: SshClient, identity: Option<&Path>) -> Options {
-    let home = std::env::var_os("HOME").map_or_else(|| PathBuf::from("/"), PathBuf::from);
-    let ssh = std::env::var_os("ICTUS_SSH_DIR").map_or_else(|| home.join(".ssh"), PathBuf::from);
-    let config = ssh.join("config");
     Options {
         method: match client {
             SshClient::Ssh2 => Method::Ssh2,
             SshClient::System => Method::System,
         },
-        config: config.is_file().then_some(config),
-        known_hosts: ssh.join("known_hosts"),
-        connect_timeout: CONNECT_MAX,
         identity: identity.map(Path::to_path_buf),
+        ..Options::from_environment()
     }
 }
 

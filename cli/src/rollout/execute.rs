@@ -74,8 +74,6 @@ pub(crate) struct Verdict {
     pub(crate) sent: u64,
     /// From the first commit to health.
     pub(crate) commit: Option<Duration>,
-    /// What parts say from now on.
-    pub(crate) parts: Merged<Happening>,
 }
 
 /// What a step's call gave.
@@ -408,7 +406,6 @@ impl Executor {
             Phase::Done => Ok(Verdict {
                 sent: self.sent,
                 commit,
-                parts: self.parts,
             }),
             Phase::Undone { cause, old_stopped } => {
                 let left = if *old_stopped {
@@ -608,7 +605,7 @@ async fn at(due: Option<tokio::time::Instant>) {
 }
 
 /// Who takes leases, in words: a hint for others.
-fn who(verb: &str) -> String {
+pub(crate) fn who(verb: &str) -> String {
     let user = std::env::var("USER").unwrap_or_else(|_| "somebody".to_owned());
     let host = rustix::system::uname();
     let host = host.nodename().to_string_lossy().into_owned();

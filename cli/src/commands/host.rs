@@ -1,0 +1,310 @@
+//! `ictus host`: machines that run federations for us.
+
+use std::io::{IsTerminal, Write};
+use std::path::{Path, PathBuf};
+
+use clap::{Args, Subcommand};
+use ictus_deploy::image::elf::{Architecture, Machine};
+use ictus_deploy::placement::{SshClient, Way};
+use ictus_deploy::ssh::{Connection, HostKey, SshError, Target, host_keys, pin};
+use ictusd::api::part::HostFacts;
+use ictusd::client::Client;
+
+use crate::error::{CliError, Kind};
+use crate::hosts::{INSTALLED, connect, options, target, unreachable_host};
+use crate::rollout::size;
+use crate::session::Session;
+use crate::ui::Ui;
+
+/// The directories that `add` makes, innermost first.
+const DIRECTORIES: [&str; 2] = [".local/share/ictus/bin", ".local/share/ictus"];
+
+/// Get hosts ready for federations, look at them, and leave them as they were
+#[derive(Debug, Args)]
+pub(crate) struct Host {
+    #[command(subcommand)]
+    what: What,
+}
+
+#[derive(Debug, Subcommand)]
+enum What {
+    /// Pin the host's key after showing it, put this program there as ictusd, and say what the host can do
+    Add(Add),
+    /// Say what a host can do
+    Check(At),
+    /// Put this version there in place of the one that is; what runs goes on
+    Upgrade(At),
+    /// Remove ictusd and all that it kept; refused while something runs
+    Rm(At),
+}
+
+#[derive(Debug, Args)]
+struct At {
+    /// `[USER@]HOST[:PORT]`, or an alias of ssh_config
+    host: String,
+    /// Have the system's `ssh` make the connection: security keys, certificates, all of ssh_config
+    #[arg(long)]
+    system_ssh: bool,
+    /// The key to log in with
+    #[arg(long, value_name = "FILE")]
+    identity: Option<PathBuf>,
+}
+
+#[derive(Debug, Args)]
+struct Add {
+    #[command(flatten)]
+    at: At,
+    /// Trust the key that the host shows, without asking
+    #[arg(long)]
+    accept_new: bool,
+    /// Trust the host's key if it has this fingerprint (`SHA256:...`)
+    #[arg(long, value_name = "SHA256:...", conflicts_with = "accept_new")]
+    fingerprint: Option<String>,
+}
+
+impl Host {
+    pub(crate) fn run(&self, ui: &mut Ui) -> Result<(), CliError> {
+        let session = Session::new()?;
+        session.block_on(async {
+            match &self.what {
+                What::Add(add) => add.run(ui, &session).await,
+                What::Check(at) => {
+                    let client = at.daemon(&session).await?;
+                    show(ui, &at.host, &client.host().await?)
+                }
+                What::Upgrade(at) => at.upgrade(ui, &session).await,
+                What::Rm(at) => at.remove(ui, &session).await,
+            }
+        })
+    }
+}
+
+impl Add {
+    async fn run(&self, ui: &mut Ui, session: &Session) -> Result<(), CliError> {
+        let at = &self.at;
+        let connection = match at.open().await {
+            Err(SshError::UnknownHostKey { .. }) => {
+                self.trust(ui).await?;
+                at.open().await
+            }
+            other => other,
+        };
+        let connection = connection.map_err(|error| unreachable_host(&at.host, &error))?;
+        for remark in connection.remarks() {
+            ui.message(remark);
+        }
+        install(ui, &at.host, &connection).await?;
+        let client = at.daemon(session).await?;
+        show(ui, &at.host, &client.host().await?)
+    }
+
+    /// Shows the host's keys and pins the one that is trusted.
+    async fn trust(&self, ui: &mut Ui) -> Result<(), CliError> {
+        let (target, options) = (self.at.target()?, self.at.options());
+        let keys = host_keys(&target, &options).await;
+        let keys = keys.map_err(|error| unreachable_host(&self.at.host, &error))?;
+        for key in &keys {
+            ui.stage(
+                "key",
+                &format!("{} {} {}", self.at.host, key.kind, key.fingerprint),
+            );
+        }
+        let trusted: Vec<&HostKey> = match &self.fingerprint {
+            Some(wanted) => keys
+                .iter()
+                .filter(|key| key.fingerprint == *wanted)
+                .collect(),
+            None if self.accept_new || confirmed(&self.at.host)? => keys.iter().collect(),
+            None => Vec::new(),
+        };
+        if trusted.is_empty() {
+            let message = format!("the key of host `{}` is not trusted", self.at.host);
+            return Err(CliError::new(Kind::Unreachable, message).hint(
+                "compare it with what `ssh-keygen -lf /etc/ssh/ssh_host_ed25519_key.pub` prints there, then give \
+                 `--fingerprint SHA256:...` or, where nobody can be in between, `--accept-new`",
+            ));
+        }
+        for key in trusted {
+            pin(&options.known_hosts, &target, key).map_err(CliError::failed)?;
+        }
+        ui.stage("pinned", &options.known_hosts.display().to_string());
+        Ok(())
+    }
+}
+
+impl At {
+    fn client(&self) -> SshClient {
+        if self.system_ssh {
+            SshClient::System
+        } else {
+            SshClient::Ssh2
+        }
+    }
+
+    fn target(&self) -> Result<Target, CliError> {
+        target(&self.host)
+    }
+
+    fn options(&self) -> ictus_deploy::ssh::Options {
+        options(self.client(), self.identity.as_deref())
+    }
+
+    async fn open(&self) -> Result<Connection, SshError> {
+        Connection::open(&self.host.parse()?, &self.options()).await
+    }
+
+    async fn daemon(&self, session: &Session) -> Result<Client, CliError> {
+        let way = Way::Ssh {
+            target: self.host.clone(),
+            client: self.client(),
+            identity: self.identity.clone(),
+        };
+        connect(session, &self.host, &way).await
+    }
+
+    async fn upgrade(&self, ui: &mut Ui, session: &Session) -> Result<(), CliError> {
+        let connection = self.open().await;
+        let connection = connection.map_err(|error| unreachable_host(&self.host, &error))?;
+        install(ui, &self.host, &connection).await?;
+        // The next one is the new one; it adopts what runs.
+        let client = self.daemon(session).await?;
+        client.give_way().await?;
+        let client = self.daemon(session).await?;
+        show(ui, &self.host, &client.host().await?)
+    }
+
+    async fn remove(&self, ui: &mut Ui, session: &Session) -> Result<(), CliError> {
+        let client = self.daemon(session).await?;
+        let names: Vec<_> = client
+            .federations()
+            .await?
+            .into_iter()
+            .map(|it| it.name)
+            .collect();
+        if !names.is_empty() {
+            let message = format!("host `{}` has federations: {}", self.host, names.join(", "));
+            let hint = format!("`ictus down NAME --host {} --purge` removes one", self.host);
+            return Err(CliError::failed(message).hint(hint));
+        }
+        client.end().await?;
+        let connection = self.open().await;
+        let connection = connection.map_err(|error| unreachable_host(&self.host, &error))?;
+        run(&self.host, &connection, &["rm", "-f", INSTALLED]).await?;
+        for directory in DIRECTORIES {
+            // What somebody else put there stays.
+            connection.run(&["rmdir", directory], &[]).await.ok();
+        }
+        ui.stage("removed", &format!("{}: ictusd", self.host));
+        Ok(())
+    }
+}
+
+/// Sends this very program, unless the host's processor is another.
+async fn install(ui: &mut Ui, name: &str, connection: &Connection) -> Result<(), CliError> {
+    let own = std::env::current_exe().map_err(CliError::failed)?;
+    let said = run(name, connection, &["uname", "-m"]).await?;
+    let machine = String::from_utf8_lossy(&said).trim().to_owned();
+    let program = program_for(name, &own, &machine)?;
+    run(name, connection, &["mkdir", "-p", DIRECTORIES[0]]).await?;
+    let whole = std::fs::metadata(&program).map_or(0, |found| found.len());
+    let mut told = |sent: u64| {
+        ui.progress(
+            "sending",
+            &format!("{name}: {} of {}", size(sent), size(whole)),
+        );
+    };
+    let sent = connection
+        .upload(&program, INSTALLED, 0o755, &mut told)
+        .await;
+    sent.map_err(|error| unreachable_host(name, &error))?;
+    ui.stage(
+        "installed",
+        &format!("{name}: ~/{INSTALLED} ({})", size(whole)),
+    );
+    Ok(())
+}
+
+/// This program, or that of another processor beside it.
+fn program_for(name: &str, own: &Path, machine: &str) -> Result<PathBuf, CliError> {
+    let wanted = Architecture::from_rust(machine);
+    let program = if wanted == Architecture::own() {
+        own.to_path_buf()
+    } else {
+        let beside = own.parent().unwrap_or(Path::new("/"));
+        beside.join("../lib/ictus").join(machine).join("ictus")
+    };
+    let found = Machine::of(&program);
+    let build = wanted.map_or("", Architecture::target);
+    let build = format!(
+        "`RUSTFLAGS='-C target-feature=+crt-static' cargo build --release -p ictus-cli --target {build}` makes one"
+    );
+    match found {
+        Ok(found) if found.interpreter.is_none() => Ok(program),
+        Ok(_) => {
+            let message = format!(
+                "{} is not static, so host `{name}` may not be able to run it",
+                program.display()
+            );
+            Err(CliError::failed(message).hint(build))
+        }
+        Err(_) => {
+            let message = format!(
+                "host `{name}` is a {machine}, and there is no ictus for it at {}",
+                program.display()
+            );
+            Err(CliError::failed(message).hint(build))
+        }
+    }
+}
+
+async fn run(name: &str, connection: &Connection, command: &[&str]) -> Result<Vec<u8>, CliError> {
+    let output = connection.run(command, &[]).await;
+    let output = output.map_err(|error| unreachable_host(name, &error))?;
+    if output.code == 0 {
+        return Ok(output.stdout);
+    }
+    let said = String::from_utf8_lossy(&output.stderr).trim().to_owned();
+    let command = command.join(" ");
+    Err(CliError::failed(format!(
+        "host `{name}`: `{command}` failed: {said}"
+    )))
+}
+
+/// Asks whoever sits at the terminal.
+fn confirmed(host: &str) -> Result<bool, CliError> {
+    if !std::io::stdin().is_terminal() {
+        return Ok(false);
+    }
+    let mut out = std::io::stderr();
+    write!(out, "is that the key of {host}? [y/N] ").map_err(CliError::failed)?;
+    let mut line = String::new();
+    std::io::stdin()
+        .read_line(&mut line)
+        .map_err(CliError::failed)?;
+    Ok(matches!(line.trim(), "y" | "Y" | "yes"))
+}
+
+fn show(ui: &mut Ui, host: &str, facts: &HostFacts) -> Result<(), CliError> {
+    ui.result(facts, || {
+        let yes = |it: bool| if it { "yes" } else { "no" };
+        let docker = match &facts.docker {
+            Ok(docker) => format!(
+                "Docker {} (API {}, {}, cgroup v{})",
+                docker.version, docker.api, docker.storage_driver, docker.cgroup_version
+            ),
+            Err(why) => format!("no Docker: {why}"),
+        };
+        format!(
+            "{host}: {} as {}, ictusd {}\n  {} with {} processors, Linux {}, {} free\n  {docker}\n  realtime scheduling: {}\n  starts at boot: {}",
+            facts.hostname,
+            facts.user,
+            facts.version,
+            facts.arch,
+            facts.cpus,
+            facts.kernel,
+            size(facts.disk_free),
+            yes(facts.realtime),
+            yes(facts.starts_at_boot),
+        )
+    })
+}
