@@ -1,8 +1,10 @@
 //! The one entry: a manifest's path in, a checked federation or every mistake out.
 
-use std::collections::BTreeMap;
-use std::net::SocketAddr;
+use std::collections::{BTreeMap, BTreeSet};
+use std::net::{IpAddr, SocketAddr, ToSocketAddrs};
 use std::path::{Path, PathBuf};
+use std::sync::mpsc;
+use std::thread;
 use std::time::Duration;
 
 use ictus_coord::plan::{ClockSync, Plan};
@@ -10,7 +12,9 @@ use serde::{Deserialize, Serialize};
 
 use crate::document::{Node, SyntaxError, Value};
 use crate::federation::{self, Executables, Member, Origin, Workshop};
+use crate::hosts::{Outside, Seating};
 use crate::manifest::{self, Manifest, TimeSpan};
+use crate::needs::{self, Outfit};
 use crate::offsets::Offsets;
 use crate::placement::{Needs, Placement};
 use crate::problem::{Place, Problem, Problems, Report};
@@ -19,6 +23,9 @@ use crate::{causality, lets, offsets, plan, policy, reactions, structure, wiring
 
 /// The longest manifest that is read, in bytes.
 const MAX_MANIFEST: u64 = 1 << 20;
+
+/// How long the addresses of a name are waited for.
+const LOOK_UP: Duration = Duration::from_secs(5);
 
 /// How much [`check`] may do.
 #[derive(Clone, Debug)]
@@ -114,15 +121,19 @@ pub struct FederateRun {
     pub id: u16,
     /// The federate's name.
     pub name: String,
-    /// The program to execute, an absolute path.
+    /// The program to execute, an absolute path; empty when it is in an image ([`Needs::image`]).
     pub executable: PathBuf,
     /// Who wrote it.
     pub kind: FederateKind,
-    /// Environment variables to add.
+    /// Environment variables to add, those of files included.
     pub env: BTreeMap<String, String>,
     /// What it needs from its host.
     #[serde(default)]
     pub needs: Needs,
+    /// Whether the program goes to another host or into a container, for this federate or another one: built from a
+    /// package it is static then.
+    #[serde(default)]
+    pub portable: bool,
 }
 
 /// Whose command line a federate's program understands.
@@ -235,10 +246,20 @@ fn check_text(
         member.description = Some(federation::foreign_description(member.federate));
     }
     let dir = absolute.parent().unwrap_or(absolute);
+    let outside = Outside {
+        dir,
+        home: std::env::var_os("HOME").map(PathBuf::from),
+        look_up: &look_up,
+        read: &read_small,
+    };
+    let seating = Seating::of(&manifest, &members, &outside, report);
+    let outfits = needs::outfits(&members, &seating, &outside, report);
+    let portable = portable(&members, &seating);
     let workshop = Workshop {
         manifest: &manifest,
         dir,
         options,
+        portable: &portable,
     };
     let mut executables = Executables::default();
     if options.build {
@@ -247,12 +268,52 @@ fn check_text(
     } else {
         workshop.inspect(report);
     }
-    Some(conclude(
-        (absolute, &manifest),
-        &members,
-        &executables,
-        report,
-    ))
+    let federates = match options.build {
+        true => runs(&members, &executables, outfits, &seating),
+        false => Vec::new(),
+    };
+    let checked = conclude((absolute, &manifest), &members, &executables, report);
+    Some(Checked {
+        federates,
+        placement: seating.placement(),
+        ..checked
+    })
+}
+
+/// The programs that go to another host or into a container with one federate at least.
+fn portable<'a>(members: &[Member<'a>], seating: &Seating<'_>) -> BTreeSet<&'a str> {
+    let travelling = members.iter().enumerate();
+    let travelling = travelling.filter(|(index, _)| seating.travels(*index));
+    travelling
+        .filter_map(|(_, member)| member.origin.program())
+        .collect()
+}
+
+/// The addresses of a name, within [`LOOK_UP`].
+fn look_up(name: &str) -> Result<Vec<IpAddr>, String> {
+    let (sender, receiver) = mpsc::channel();
+    let name = name.to_owned();
+    thread::spawn(move || {
+        let all = (name.as_str(), 0).to_socket_addrs();
+        let all = all.map(|all| all.map(|one| one.ip()).collect());
+        // Nobody may be waiting any more.
+        drop(sender.send(all.map_err(|error| error.to_string())));
+    });
+    receiver
+        .recv_timeout(LOOK_UP)
+        .unwrap_or_else(|_| Err(format!("no answer within {} s", LOOK_UP.as_secs())))
+}
+
+/// A file's text, if it is a file and not longer than [`MAX_MANIFEST`].
+fn read_small(path: &Path) -> Result<String, String> {
+    let metadata = std::fs::metadata(path).map_err(|error| error.to_string())?;
+    if !metadata.is_file() {
+        return Err("it is not a file".to_owned());
+    }
+    if metadata.len() > MAX_MANIFEST {
+        return Err(format!("it is longer than {MAX_MANIFEST} bytes"));
+    }
+    std::fs::read_to_string(path).map_err(|error| error.to_string())
 }
 
 /// Everything that follows once it is known what the federates look like.
@@ -271,7 +332,7 @@ fn conclude(
         manifest: path.to_path_buf(),
         plan: plan::resolve(manifest, members, (wires, offsets.as_ref())),
         offsets,
-        federates: runs(members, executables),
+        federates: Vec::new(),
         placement: None,
         settings: settings(manifest),
         timing,
@@ -331,33 +392,48 @@ fn syntax_fix(text: &str, error: &SyntaxError) -> &'static str {
     ""
 }
 
-fn runs(members: &[Member<'_>], executables: &Executables) -> Vec<FederateRun> {
-    let run = |(id, member): (u16, &Member<'_>)| {
-        let (executable, kind) = match member.origin {
-            Origin::Ours { program, .. } => {
-                (executables.programs.get(program?)?, FederateKind::Ours)
-            }
-            Origin::Foreign { .. } => {
+/// How each member is run; of those whose program is not there, nothing.
+fn runs(
+    members: &[Member<'_>],
+    executables: &Executables,
+    outfits: Vec<Outfit>,
+    seating: &Seating<'_>,
+) -> Vec<FederateRun> {
+    let portable = portable(members, seating);
+    let run = |((id, member), outfit): ((u16, &Member<'_>), Outfit)| {
+        let (executable, kind, sent) = match member.origin {
+            Origin::Ours { program, .. } => (
+                executables.programs.get(program?)?.clone(),
+                FederateKind::Ours,
+                portable.contains(program?),
+            ),
+            Origin::Foreign { binary } => {
                 let args = member.federate.args.clone();
-                (
-                    executables.foreign.get(member.name)?,
-                    FederateKind::Foreign { args },
-                )
+                let kind = FederateKind::Foreign { args };
+                match binary {
+                    Some(_) => {
+                        let executable = executables.foreign.get(member.name)?.clone();
+                        (executable, kind, seating.travels(usize::from(id)))
+                    }
+                    None => (PathBuf::new(), kind, false),
+                }
             }
         };
-        let env = member.federate.env.0.iter();
         Some(FederateRun {
             id,
             name: member.name.to_owned(),
-            executable: executable.clone(),
+            executable,
             kind,
-            env: env
-                .map(|(name, value)| (name.clone(), value.to_string()))
-                .collect(),
-            needs: Needs::default(),
+            env: outfit.env,
+            needs: outfit.needs,
+            portable: sent,
         })
     };
-    (0_u16..).zip(members).filter_map(run).collect()
+    (0_u16..)
+        .zip(members)
+        .zip(outfits)
+        .filter_map(run)
+        .collect()
 }
 
 /// The one executable that has the class of every federate.
@@ -401,8 +477,6 @@ mod classes;
 
 #[cfg(test)]
 mod tests {
-    use std::collections::BTreeSet;
-
     use ictus_coord::describe::InstanceRequest;
     use proptest::prelude::*;
     use serde_json::Value as Json;
@@ -428,6 +502,17 @@ mod tests {
                 });
             }
             let path = Path::new("/nowhere/federation.yaml");
+            let outside = Outside {
+                dir: Path::new("/nowhere"),
+                home: Some("/home/x".into()),
+                look_up: &|name| match name {
+                    "bench.lan" => Ok(vec![IpAddr::from([10, 0, 0, 12])]),
+                    _ => Err("unknown".to_owned()),
+                },
+                read: &|_| Ok("A=1\n".to_owned()),
+            };
+            let seating = Seating::of(&manifest, &members, &outside, &mut report);
+            needs::outfits(&members, &seating, &outside, &mut report);
             let executables = Executables::default();
             let checked = conclude((path, &manifest), &members, &executables, &mut report);
             assert_eq!(checked.plan.federates.len(), members.len());

@@ -166,6 +166,67 @@ pub(crate) const CODES: &[(&str, &str)] = &[
          or coordinate centrally. An offset of more than an hour is refused too: it is a mistake.",
     ),
     (
+        "F030",
+        "Something is to run on a host that `hosts` does not have, or does not say where it runs. With \
+         one host everything runs there; with several, each federate and the coordinator names one \
+         (`host:`, `rti: { host: }`), or `defaults: { host: }` holds for those that do not.",
+    ),
+    (
+        "F031",
+        "A host is either this machine (`local: true`) or reached over ssh (`ssh: [USER@]HOST[:PORT]`, or \
+         an alias of ssh_config). Letters, digits and `._-` make a name, and nothing begins with `-`, so \
+         that no part of a manifest can be an option or a command.",
+    ),
+    (
+        "F032",
+        "`hosts.NAME.address` is where the federates of a host are reached by those of the others: an IPv4 \
+         address in the network that they share, because Lingua Franca's messages have four bytes for it. \
+         A name is resolved once, here. Left out, it is the address in `ssh`; an alias or a loopback \
+         address does not say it. Each host is another machine with another address.",
+    ),
+    (
+        "F033",
+        "`hosts.NAME.ports` is a range such as `15045-15099`, both ends included, of at most 10000 ports. \
+         The coordinator's port must be one of them, and there must be one for every member of the host \
+         that listens: the coordinator, and each federate when messages go from federate to federate.",
+    ),
+    (
+        "F034",
+        "Messages between hosts are in clear text: whoever is in the hosts' network can read them, join the \
+         federation and stop it. `security: trusted-network` says that this is known, and is required as \
+         soon as `hosts` has more than one. `mtls` (certificates) is not there yet.",
+    ),
+    (
+        "F035",
+        "Limits of memory and processes, devices, volumes and images are given by containers: the host of \
+         such a federate has `engine: docker`. Processors, realtime scheduling, variables and secrets work \
+         with both engines.",
+    ),
+    (
+        "F036",
+        "What a federate needs from its host cannot be given so: a path that is not absolute or has a `..`, \
+         a volume over what is Ictus' own (`/ictus`, `/.ictus`, `/app`, `/`), a user or image whose name \
+         has no such form, too little memory, a processor named twice.",
+    ),
+    (
+        "F037",
+        "A file of environment variables cannot be read. Each line is `KEY=VALUE`, empty, or a comment \
+         after `#`. A value may stand in single quotes, where every character is itself, or in double ones, \
+         where `\\n`, `\\r`, `\\t`, `\\\"`, `\\\\` and `\\$` are escapes. Nothing is replaced: `$NAME` stays as it is. \
+         Messages never show a value.",
+    ),
+    (
+        "F038",
+        "A secret is a name, whose value is read from the environment when the federation is started, or \
+         `{ name, file }`. The federate finds it in a file that `NAME_FILE` names. It is never an environment \
+         variable of the federate, because those can be read from outside.",
+    ),
+    (
+        "F039",
+        "A program is built on this machine and asked here what it consists of, so it can only go to hosts \
+         of the same architecture. Prebuilt Lingua Franca federates and images may be of another one.",
+    ),
+    (
         "W001",
         "No connection leads to an input, so its reactions will not run.",
     ),
@@ -187,6 +248,10 @@ pub(crate) const CODES: &[(&str, &str)] = &[
         "The offset of a foreign federate is compiled in. The one shown here is what it needs; \
          what it has, only its `stp_offset` in the manifest says, and its receivers' offsets are \
          solved with that.",
+    ),
+    (
+        "W006",
+        "With engine process, only a daemon that runs as root can start a federate as another user.",
     ),
 ];
 

@@ -35,8 +35,8 @@ pub(crate) enum Origin<'a> {
         program: Option<&'a str>,
         class: Option<&'a str>,
     },
-    /// A prebuilt Lingua Franca federate.
-    Foreign { binary: &'a str },
+    /// A prebuilt Lingua Franca federate; without a binary it is in an image.
+    Foreign { binary: Option<&'a str> },
 }
 
 /// The members in order of their ids.
@@ -77,20 +77,25 @@ fn origin<'a>(
 ) -> Origin<'a> {
     let path = ["federates", name];
     let at = |key| ["federates", name, key];
-    if let Some(binary) = &federate.binary {
+    if let Some(kind) = foreign_key(federate) {
+        if federate.image.is_some() && kind != "image" {
+            let message = format!("`{name}` has both `binary` and `image`");
+            report.add(
+                "F025",
+                Place::key(&at("image")),
+                message,
+                "keep one of them",
+            );
+        }
         let ours = [
             ("program", federate.program.is_some()),
             ("class", federate.class.is_some()),
             ("parameters", !federate.parameters.is_empty()),
         ];
         for (key, _) in ours.iter().filter(|(_, given)| *given) {
-            let message = format!("`{key}` does not go with `binary`: `{name}` is foreign");
-            report.add(
-                "F025",
-                Place::key(&at(key)),
-                message,
-                format!("remove `{key}` or `binary`"),
-            );
+            let message = format!("`{key}` does not go with `{kind}`: `{name}` is foreign");
+            let fix = format!("remove `{key}` or `{kind}`");
+            report.add("F025", Place::key(&at(key)), message, fix);
         }
         if federate.id.is_none() && !report.is_broken(&at("id")) {
             let fix = "add `id:`, the federate id that was compiled in";
@@ -101,7 +106,9 @@ fn origin<'a>(
                 fix,
             );
         }
-        return Origin::Foreign { binary };
+        return Origin::Foreign {
+            binary: federate.binary.as_deref(),
+        };
     }
     let foreign = [
         ("id", federate.id.is_some()),
@@ -132,6 +139,15 @@ fn origin<'a>(
     Origin::Ours {
         program: program_of(manifest, name, federate, report),
         class: federate.class.as_deref(),
+    }
+}
+
+/// The key that makes a federate foreign.
+fn foreign_key(federate: &Federate) -> Option<&'static str> {
+    match (&federate.binary, &federate.image) {
+        (Some(_), _) => Some("binary"),
+        (None, Some(_)) => Some("image"),
+        (None, None) => None,
     }
 }
 
@@ -228,6 +244,8 @@ pub(crate) struct Workshop<'a> {
     /// The manifest's folder.
     pub(crate) dir: &'a Path,
     pub(crate) options: &'a CheckOptions,
+    /// The programs that must run on any host of their architecture.
+    pub(crate) portable: &'a BTreeSet<&'a str>,
 }
 
 impl Workshop<'_> {
@@ -272,6 +290,7 @@ impl Workshop<'_> {
                         program: name,
                         dir: &dir,
                         bin,
+                        portable: self.portable.contains(name.as_str()),
                     };
                     program::build(wanted, self.options, progress)
                 }
@@ -289,7 +308,10 @@ impl Workshop<'_> {
             }
         }
         for member in members {
-            if let Origin::Foreign { binary } = member.origin {
+            if let Origin::Foreign {
+                binary: Some(binary),
+            } = member.origin
+            {
                 match program::existing(&self.dir.join(binary)) {
                     Ok(path) => {
                         executables.foreign.insert(member.name.to_owned(), path);
@@ -365,13 +387,20 @@ impl Workshop<'_> {
     }
 }
 
+impl<'a> Origin<'a> {
+    /// The program that has the class.
+    pub(crate) fn program(&self) -> Option<&'a str> {
+        match self {
+            Self::Ours { program, .. } => *program,
+            Self::Foreign { .. } => None,
+        }
+    }
+}
+
 impl Member<'_> {
     /// The program that has the member's class.
     pub(crate) fn program(&self) -> Option<&str> {
-        match self.origin {
-            Origin::Ours { program, .. } => program,
-            Origin::Foreign { .. } => None,
-        }
+        self.origin.program()
     }
 
     /// Whether it is a prebuilt Lingua Franca federate.
@@ -468,7 +497,7 @@ fn report_build(name: &str, source: Source<'_>, error: &BuildError, report: &mut
                 fix,
             );
         }
-        BuildError::NoCargo(_) | BuildError::Failed(_) => {
+        BuildError::NoCargo(_) | BuildError::NoTriple(_) | BuildError::Failed(_) => {
             let message = format!("program `{name}` cannot be built: {error}");
             let fix = format!("run `cargo build` in `{}` to see everything", source.path());
             report.add("F021", Place::key(&["programs", name]), message, fix);

@@ -1,5 +1,7 @@
 //! The manifest as it is written: the types behind the JSON Schema. Nothing is checked here but form.
 
+mod host;
+mod needs;
 mod scalar;
 mod words;
 
@@ -8,12 +10,16 @@ use schemars::{JsonSchema, Schema, SchemaGenerator, json_schema};
 use serde::Deserialize;
 use serde_json::Value;
 
+pub(crate) use self::host::{Host, PortsText, Security};
+pub(crate) use self::needs::{RealtimeText, Secret, VolumeText};
 pub(crate) use self::scalar::{
     Address, ByteSize, LinkMap, Named, OffsetText, OneOrMany, Port, Scalar, SignedSpan, TimeSpan,
     split_link,
 };
 use self::scalar::{CountWord, Name};
-use self::words::{ClockSyncWord, CoordinationWord, OnExceedWord, OnFailureWord, WireWord};
+use self::words::{
+    ClockSyncWord, CoordinationWord, OnExceedWord, OnFailureWord, SecurityWord, WireWord,
+};
 
 /// A federation: what runs, how it is connected, and how long.
 ///
@@ -56,6 +62,12 @@ pub(crate) struct Manifest {
     /// are made of it.
     #[serde(default)]
     pub(crate) bounds: AllBounds,
+    /// Where it runs; left out, everything runs on this machine as processes.
+    #[serde(default)]
+    pub(crate) hosts: Named<Host>,
+    /// What protects the messages between hosts.
+    #[schemars(with = "Option<SecurityWord>")]
+    pub(crate) security: Option<Security>,
     /// The coordinator.
     #[serde(default)]
     pub(crate) rti: Rti,
@@ -147,7 +159,9 @@ pub(crate) struct Metrics {
 #[derive(Clone, Debug, Default, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct Rti {
-    /// Its TCP port on the loopback address; `auto` takes a free one.
+    /// The host on which it runs.
+    pub(crate) host: Option<String>,
+    /// Its TCP port; `auto` takes a free one.
     pub(crate) port: Option<Port>,
 }
 
@@ -163,7 +177,7 @@ pub(crate) struct Program {
     pub(crate) binary: Option<String>,
 }
 
-/// One federate: a class of a program, or a prebuilt Lingua Franca federate (`binary`).
+/// One federate: a class of a program, or a prebuilt Lingua Franca federate (`binary` or `image`).
 #[derive(Clone, Debug, Default, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct Federate {
@@ -176,6 +190,8 @@ pub(crate) struct Federate {
     pub(crate) parameters: Named<Value>,
     /// Foreign: the executable, relative to the manifest.
     pub(crate) binary: Option<String>,
+    /// Foreign: in place of `binary`, an image with the executable (engine docker).
+    pub(crate) image: Option<String>,
     /// Foreign: arguments after those that every LF federate gets.
     #[serde(default)]
     pub(crate) args: Vec<String>,
@@ -184,9 +200,36 @@ pub(crate) struct Federate {
     /// Foreign: its ports.
     #[serde(default)]
     pub(crate) ports: Ports,
-    /// Environment variables to add.
+    /// The host on which it runs; may be left out when there is only one, or `defaults.host`.
+    pub(crate) host: Option<String>,
+    /// Environment variables to add; they come before those of `env_file`.
     #[serde(default)]
     pub(crate) env: Named<Scalar>,
+    /// Files of lines `KEY=VALUE`, relative to the manifest; of one key, the last counts.
+    #[serde(default)]
+    pub(crate) env_file: Vec<String>,
+    /// What is handed over as a file, which `NAME_FILE` names: never part of a record, log or command line.
+    #[serde(default)]
+    pub(crate) secrets: Vec<Secret>,
+    /// The processors it may run on; left out, all.
+    #[serde(default)]
+    #[schemars(inner(range(min = 0, max = 4095)))]
+    pub(crate) cpus: Vec<u32>,
+    /// The most memory (engine docker).
+    pub(crate) memory: Option<ByteSize>,
+    /// The most processes and threads (engine docker).
+    #[schemars(range(min = 1, max = 4_194_304))]
+    pub(crate) pids: Option<u32>,
+    /// Who it runs as: `UID`, `UID:GID`, or names; left out, the daemon's user.
+    pub(crate) user: Option<String>,
+    /// Device files, absolute (engine docker).
+    #[serde(default)]
+    pub(crate) devices: Vec<String>,
+    /// Directories of the host that it sees (engine docker).
+    #[serde(default)]
+    pub(crate) volumes: Vec<VolumeText>,
+    /// Realtime scheduling.
+    pub(crate) realtime: Option<RealtimeText>,
     /// How long after a tag's time it waits for messages (decentralized coordination); `auto` solves it from the bounds.
     pub(crate) stp_offset: Option<OffsetText>,
     /// L of everything it sends.
@@ -301,6 +344,8 @@ pub(crate) struct Connection {
 #[derive(Clone, Debug, Default, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct Defaults {
+    /// The host of everything that names none.
+    pub(crate) host: Option<String>,
     /// How long an ordered stop may take before processes are killed.
     pub(crate) stop_grace: Option<TimeSpan>,
     /// How long federates may take to join.

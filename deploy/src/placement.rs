@@ -65,7 +65,7 @@ pub struct HostSpec {
     pub name: String,
     /// How it is reached.
     pub way: Way,
-    /// Where its federates are reached by those of other hosts.
+    /// Where its federates are reached by those of other hosts; loopback when there is no other.
     pub address: Ipv4Addr,
     /// What runs its members.
     pub engine: Engine,
@@ -87,7 +87,7 @@ pub struct Placement {
 
 /// A scheduling policy of the kernel.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
+#[serde(rename_all = "kebab-case")]
 pub enum RealtimePolicy {
     /// `SCHED_FIFO`.
     Fifo,

@@ -178,6 +178,11 @@ impl Report {
         }
     }
 
+    /// Whether further mistakes are only counted, so that nothing need be said of them.
+    pub(crate) fn is_full(&self) -> bool {
+        self.problems.len() >= MAX_PROBLEMS
+    }
+
     /// Adds a warning.
     pub(crate) fn warn(
         &mut self,

@@ -1,5 +1,6 @@
 //! Programs: built by cargo, then asked what they consist of.
 
+use std::ffi::{OsStr, OsString};
 use std::io::Read;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Stdio};
@@ -35,6 +36,9 @@ pub(crate) enum BuildError {
     /// Cargo could not be started.
     #[error("cannot run cargo: {0}")]
     NoCargo(std::io::Error),
+    /// Cargo does not say for what it builds.
+    #[error("`cargo -vV` does not say the host's target triple: {0}")]
+    NoTriple(String),
     /// Cargo failed; the first error it gave.
     #[error("{0}")]
     Failed(String),
@@ -87,11 +91,14 @@ pub(crate) struct PackageBuild<'a> {
     pub(crate) dir: &'a Path,
     /// The binary, when named.
     pub(crate) bin: Option<&'a str>,
+    /// Whether the executable is to run on any host of this architecture, and in an empty container: static.
+    pub(crate) portable: bool,
 }
 
 /// Builds a package's binary; gives the executable.
 ///
-/// No `--target`: the executable is for this machine, and shares what is compiled with builds by hand.
+/// Without `portable` there is no `--target`: the executable is for this machine, and shares what is compiled with
+/// builds by hand.
 pub(crate) fn build(
     wanted: PackageBuild<'_>,
     options: &CheckOptions,
@@ -109,7 +116,7 @@ pub(crate) fn build(
         program: wanted.program.to_owned(),
     });
     let cargo = std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into());
-    let mut command = Command::new(cargo);
+    let mut command = Command::new(&cargo);
     command
         .arg("build")
         .arg("--message-format=json")
@@ -121,6 +128,13 @@ pub(crate) fn build(
     };
     if options.release {
         command.arg("--release");
+    }
+    if wanted.portable {
+        // `--target` also for this machine's own triple: without it the flag would hold for procedural macros too,
+        // and those cannot be static.
+        let triple = host_triple(&cargo, &dir)?;
+        let (name, flags) = static_flags(&triple, &|name| std::env::var_os(name));
+        command.arg("--target").arg(&triple).env(name, flags);
     }
     if let Some(target_dir) = &options.target_dir {
         command.arg("--target-dir").arg(target_dir);
@@ -155,6 +169,53 @@ pub(crate) fn build(
         ));
     }
     outcome.executable(wanted)
+}
+
+/// The triple for which cargo builds when it is not told, with the toolchain of a folder.
+fn host_triple(cargo: &OsStr, dir: &Path) -> Result<String, BuildError> {
+    let mut command = Command::new(cargo);
+    let command = command.arg("-vV").current_dir(dir).stdin(Stdio::null());
+    let output = command.output().map_err(BuildError::NoCargo)?;
+    let text = String::from_utf8_lossy(&output.stdout);
+    let triple = text.lines().find_map(|line| line.strip_prefix("host: "));
+    let word = |c: char| c.is_ascii_alphanumeric() || c == '-' || c == '_' || c == '.';
+    match triple.map(str::trim) {
+        Some(triple) if !triple.is_empty() && triple.chars().all(word) => Ok(triple.to_owned()),
+        Some(_) | None => {
+            let stderr = String::from_utf8_lossy(&output.stderr);
+            let line = stderr.lines().chain(text.lines()).next();
+            Err(BuildError::NoTriple(
+                line.unwrap_or("it said nothing").to_owned(),
+            ))
+        }
+    }
+}
+
+/// The variable that makes rustc link statically for a triple, with its value. Cargo takes its flags from the first
+/// place that has any, so ours join those that are there.
+fn static_flags(triple: &str, env: &dyn Fn(&str) -> Option<OsString>) -> (String, OsString) {
+    const OURS: [&str; 2] = ["-C", "target-feature=+crt-static"];
+    let encoded = "CARGO_ENCODED_RUSTFLAGS";
+    let own = format!(
+        "CARGO_TARGET_{}_RUSTFLAGS",
+        triple.to_uppercase().replace(['-', '.'], "_")
+    );
+    let (name, separator, have) = if let Some(have) = env(encoded) {
+        (encoded.to_owned(), "\u{1f}", have)
+    } else if let Some(have) = env("RUSTFLAGS") {
+        ("RUSTFLAGS".to_owned(), " ", have)
+    } else {
+        let have = env(&own).unwrap_or_default();
+        (own, " ", have)
+    };
+    let mut flags = have;
+    for flag in OURS {
+        if !flags.is_empty() {
+            flags.push(separator);
+        }
+        flags.push(flag);
+    }
+    (name, flags)
 }
 
 /// What cargo's messages said.
@@ -438,5 +499,46 @@ fn quoted(stderr: &str) -> String {
         String::new()
     } else {
         format!(":\n{}", shown.join("\n"))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// What the environment has, then what cargo is given.
+    #[test]
+    fn flags_of_the_user_are_kept() {
+        let own = "CARGO_TARGET_X86_64_UNKNOWN_LINUX_GNU_RUSTFLAGS";
+        let ours = "-C target-feature=+crt-static";
+        let table: &[(&[(&str, &str)], &str, String)] = &[
+            (&[], own, ours.to_owned()),
+            (&[(own, "-g")], own, format!("-g {ours}")),
+            (
+                &[("RUSTFLAGS", "-C opt-level=1"), (own, "-g")],
+                "RUSTFLAGS",
+                format!("-C opt-level=1 {ours}"),
+            ),
+            (
+                &[
+                    ("RUSTFLAGS", "-g"),
+                    ("CARGO_ENCODED_RUSTFLAGS", "-C\u{1f}opt-level=1"),
+                ],
+                "CARGO_ENCODED_RUSTFLAGS",
+                "-C\u{1f}opt-level=1\u{1f}-C\u{1f}target-feature=+crt-static".to_owned(),
+            ),
+        ];
+        for (have, name, flags) in table {
+            let env = |wanted: &str| {
+                let found = have.iter().find(|(name, _)| *name == wanted);
+                found.map(|(_, value)| OsString::from(value))
+            };
+            let given = static_flags("x86_64-unknown-linux-gnu", &env);
+            assert_eq!(
+                given,
+                ((*name).to_owned(), OsString::from(flags)),
+                "{have:?}"
+            );
+        }
     }
 }

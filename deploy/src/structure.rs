@@ -110,7 +110,10 @@ impl<'a> Walker<'a> {
                     .into_iter()
                     .flat_map(|all| all.keys())
                     .map(String::as_str);
-                let fix = places::fix(self.schema, &key.name, &known.collect::<Vec<_>>());
+                let fix = match self.report.is_full() {
+                    true => String::new(),
+                    false => places::fix(self.schema, &key.name, &known.collect::<Vec<_>>()),
+                };
                 let message = format!("unknown key `{}`", key.name);
                 self.report
                     .add("F003", Place::new(&self.path, Part::Key), message, fix);
@@ -367,13 +370,11 @@ impl<'a> Walker<'a> {
 
 /// What stands for a wrong item of a list, so that those after it keep their positions.
 fn gap(schema: &Json) -> Value {
-    let items = schema.get("items");
-    let text =
-        items.is_some_and(|items| items.get("type").and_then(Json::as_str) == Some("string"));
-    if text {
-        Value::Text(String::new())
-    } else {
-        Value::Map(Vec::new())
+    let kind = schema.pointer("/items/type").and_then(Json::as_str);
+    match kind {
+        Some("string") => Value::Text(String::new()),
+        Some("integer") => Value::Integer(0),
+        Some(_) | None => Value::Map(Vec::new()),
     }
 }
 

@@ -7,14 +7,22 @@
 )]
 
 use std::fs;
+use std::net::Ipv4Addr;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
+use ictus_coord::describe::{InstanceDescriptions, InstanceRequest, ProgramDescription};
 use ictus_coord::measure::Upstream;
-use ictus_coord::plan::{ClockPlan, ClockSync, Coordination, OnFailure, Wire};
+use ictus_coord::plan::{ClockPlan, ClockSync, Coordination, FORMAT, OnFailure, Wire};
 use ictus_coord::report::{FederateMeasures, FederationMeasures};
+use ictus_deploy::placement::{Realtime, RealtimePolicy, SecretSource, SshClient, Volume, Way};
 use ictus_deploy::timing::suggest;
-use ictus_deploy::{CheckOptions, Checked, FederateKind, Problems, Progress, check};
+use ictus_deploy::{
+    CheckOptions, Checked, Engine, FederateKind, Needs, PortRange, Problems, Progress, check,
+};
+
+#[path = "../testdata/classes.rs"]
+mod classes;
 
 /// A folder with a manifest and `bin/NAME` for every name the fake program knows.
 struct Bench {
@@ -25,6 +33,16 @@ impl Bench {
     fn new(manifest: &str) -> Self {
         let dir = tempfile::tempdir().unwrap();
         fs::write(dir.path().join("federation.yaml"), manifest).unwrap();
+        fs::write(
+            dir.path().join("radar.env"),
+            "# of the radar\nGAIN='3'\nRUST_LOG=warn\n",
+        )
+        .unwrap();
+        fs::write(
+            dir.path().join("bad.env"),
+            "A=1\nexport B=hunter2\nC\nA=hunter2\n",
+        )
+        .unwrap();
         fs::create_dir(dir.path().join("bin")).unwrap();
         let names = [
             "fake", "tools", "camera", "hang", "crash", "garbage", "flood", "old", "short",
@@ -95,7 +113,7 @@ fn the_example_is_a_federation() {
         .unwrap_or_else(|p| panic!("{p}"));
     let plan = &checked.plan;
     let names = plan.federates.iter().map(|one| one.name.as_str());
-    assert!(names.eq(["radar", "planner", "logger", "camera"]));
+    assert!(names.eq(["radar", "planner", "logger", "camera", "viewer"]));
     assert_eq!(plan.timeout_ns, Some(10_000_000_000));
     assert!(plan.extensions);
     let wires: Vec<String> = plan
@@ -176,7 +194,7 @@ fn the_example_is_decentralized() {
     assert_eq!(plan.clock, clock);
     let listen = checked.settings.metrics_listen;
     assert_eq!(listen, Some("127.0.0.1:9464".parse().unwrap()));
-    let [radar, planner, logger, camera] = plan.federates.as_slice() else {
+    let [radar, planner, logger, camera, _viewer] = plan.federates.as_slice() else {
         panic!("{plan:?}")
     };
     assert_eq!(radar.test_clock_offset_ns, -50_000_000);
@@ -213,7 +231,8 @@ radar 0 ms: no input to wait for
 planner 0.5 ms = radar offset 0 + radar launch lag 1.0 + network 4.0 + clock 0.5 - after 5.0
 logger 7.5 ms = planner offset 0.5 + planner launch lag 2.0 + network 4.0 + clock 1.0 - after 0
 camera 6.0 ms as declared; required 6.0 ms = planner offset 0.5 + planner launch lag 2.0 + network 3.0 + clock 0.5 \
-         - after 0"
+         - after 0\n\
+viewer 0 ms: no input to wait for"
     );
     let warnings: Vec<&str> = checked.warnings.iter().map(|one| one.code).collect();
     assert_eq!(warnings, ["W003"], "only `max_lead` has no effect");
@@ -237,6 +256,223 @@ fn a_breakdown_names_every_term() {
         offsets.to_string().lines().last().unwrap(),
         "brake 6.4 ms = planner offset 0.9 + planner launch lag 2.0 + network 3.0 + clock 0.5 - after 0"
     );
+}
+
+/// Which member runs where, and what it needs there.
+#[test]
+fn the_example_is_placed() {
+    let bench = Bench::new(&example());
+    let checked = bench
+        .check(&CheckOptions::default())
+        .unwrap_or_else(|p| panic!("{p}"));
+    let placement = checked.placement.unwrap();
+    let names: Vec<&str> = placement
+        .hosts
+        .iter()
+        .map(|host| host.name.as_str())
+        .collect();
+    assert_eq!(names, ["bench", "nuc", "vision"]);
+    assert_eq!(
+        (placement.rti, placement.federates),
+        (1, vec![1, 0, 0, 0, 2])
+    );
+    let nuc = &placement.hosts[1];
+    assert_eq!(nuc.address, Ipv4Addr::new(10, 0, 0, 11));
+    assert_eq!(nuc.engine, Engine::Docker);
+    let range = PortRange {
+        first: 15_045,
+        last: 15_099,
+    };
+    assert_eq!(nuc.ports, Some(range));
+    let Way::Ssh {
+        target,
+        client,
+        identity,
+    } = &nuc.way
+    else {
+        panic!("{nuc:?}")
+    };
+    assert_eq!(
+        (target.as_str(), *client),
+        ("robot@10.0.0.11", SshClient::Ssh2)
+    );
+    assert!(identity.as_ref().unwrap().ends_with(".ssh/id_robots"));
+    assert_eq!(placement.hosts[0].way, Way::Local);
+
+    let radar = &checked.federates[0];
+    let maps = Volume {
+        host: "/data/maps".into(),
+        at: "/maps".into(),
+        read_only: true,
+    };
+    let home = PathBuf::from(std::env::var_os("HOME").unwrap());
+    let secrets = [
+        ("MAP_KEY".to_owned(), SecretSource::Environment),
+        ("TOKEN".to_owned(), SecretSource::File(home.join(".radar"))),
+    ];
+    let needs = Needs {
+        cpus: vec![0, 1],
+        memory: Some(256 << 20),
+        pids: Some(64),
+        user: Some("1000:1000".into()),
+        devices: vec!["/dev/ttyUSB0".into()],
+        volumes: vec![maps],
+        realtime: Some(Realtime {
+            policy: RealtimePolicy::Fifo,
+            priority: 60,
+            lock_memory: true,
+        }),
+        secrets: secrets.into(),
+        image: None,
+    };
+    assert_eq!(radar.needs, needs);
+    assert_eq!(radar.env["GAIN"], "3");
+    assert_eq!(radar.env["RUST_LOG"], "info", "`env` comes before files");
+    let viewer = &checked.federates[4];
+    assert_eq!(
+        viewer.needs.image.as_deref(),
+        Some("registry.lan/viewer:1.2")
+    );
+    assert_eq!(viewer.executable, PathBuf::new());
+    let portable: Vec<bool> = checked.federates.iter().map(|run| run.portable).collect();
+    assert_eq!(
+        portable,
+        [true, true, false, false, false],
+        "radar's program is the planner's too"
+    );
+}
+
+/// A manifest of two federates, with more lines.
+fn pair(more: &str) -> String {
+    format!(
+        "ictus: v1\nfederation: f\nprograms: {{ fake: {{ binary: bin/fake }} }}\n\
+         federates: {{ a: {{ class: Relay }}, b: {{ class: Relay }} }}\n\
+         connections: [{{ from: a.out, to: b.input }}]\n{more}"
+    )
+}
+
+#[test]
+fn one_host_has_everything_and_no_address() {
+    let place = |more: &str| {
+        let checked = Bench::new(&pair(more)).check(&CheckOptions::default());
+        checked.unwrap_or_else(|p| panic!("{p}")).placement
+    };
+    assert_eq!(place(""), None);
+    let placement = place("hosts: { nuc: { ssh: robot@nuc } }\n").unwrap();
+    assert_eq!(placement.hosts[0].address, Ipv4Addr::LOCALHOST);
+    assert_eq!((placement.rti, placement.federates), (0, vec![0, 0]));
+    // Of two, the one on which nothing runs plays no part.
+    let two = "hosts: { nuc: { ssh: robot@nuc }, bench: { local: true } }\nsecurity: trusted-network\n\
+               defaults: { host: bench }\n";
+    let placement = place(two).unwrap();
+    assert_eq!(placement.hosts.len(), 1);
+    assert_eq!(placement.hosts[0].way, Way::Local);
+    // The address in `ssh` is the default; hosts on one machine may all be loopback.
+    let three = "hosts: { c: { ssh: x@127.0.0.2:2201 }, b: { ssh: \"127.0.0.3\", ports: 15045 } }\n\
+                 security: trusted-network\nrti: { host: b, port: 15045 }\ndefaults: { host: c }\n";
+    let placement = place(three).unwrap();
+    let addresses: Vec<u8> = placement
+        .hosts
+        .iter()
+        .map(|host| host.address.octets()[3])
+        .collect();
+    assert_eq!(addresses, [3, 2]);
+    assert_eq!((placement.rti, placement.federates), (0, vec![1, 1]));
+}
+
+#[test]
+fn a_host_of_another_architecture_gets_no_program() {
+    let other = match std::env::consts::ARCH {
+        "aarch64" => "amd64",
+        _ => "arm64",
+    };
+    let hosts = format!("hosts: {{ pi: {{ ssh: pi@10.0.0.7, arch: {other} }} }}\n");
+    let shown = Bench::new(&pair(&hosts)).shown(&CheckOptions::default());
+    let said = format!("`a` runs on `pi`, which is {other}");
+    assert!(shown.contains(&said) && shown.contains("[F039]"), "{shown}");
+    assert!(shown.contains("`rustup target add "), "{shown}");
+    assert!(shown.contains("`apt-get install gcc-"), "{shown}");
+}
+
+/// The interpreter that a 64-bit ELF file names: the dynamic linker, if it needs one.
+fn has_interpreter(executable: &Path) -> bool {
+    let bytes = fs::read(executable).unwrap();
+    let number = |at: usize, length: usize| {
+        let digits = bytes[at..at + length].iter().rev();
+        digits.fold(0_usize, |sum, byte| sum * 256 + usize::from(*byte))
+    };
+    let (table, size, count) = (number(0x20, 8), number(0x36, 2), number(0x38, 2));
+    (0..count).any(|index| number(table + index * size, 4) == 3)
+}
+
+/// A program that goes to another host needs nothing there; it may use procedural macros. One that stays is as ever.
+#[test]
+fn a_program_that_travels_is_static() {
+    let manifest = "ictus: v1\nfederation: f\nprograms: { p: { package: broken } }\n\
+                    federates: { a: { class: Relay }, b: { class: Relay, MORE } }\nHOSTS\n";
+    let describe = |bench: &Bench| {
+        let classes = ProgramDescription {
+            ictus: FORMAT.to_owned(),
+            classes: classes::classes(),
+        };
+        let request = |name: &str| InstanceRequest {
+            name: name.to_owned(),
+            class: "Relay".to_owned(),
+            parameters: serde_json::Map::new(),
+        };
+        let instances = InstanceDescriptions {
+            ictus: FORMAT.to_owned(),
+            instances: ["a", "b"]
+                .map(|name| classes::instance(&request(name)))
+                .into(),
+        };
+        let main = format!(
+            "fn main() {{ let one = std::env::args().count() == 2; noop::noop!();\n\
+             println!(\"{{}}\", if one {{ r####\"{}\"#### }} else {{ r####\"{}\"#### }}); }}\n",
+            serde_json::to_string(&classes).unwrap(),
+            serde_json::to_string(&instances).unwrap(),
+        );
+        package(bench, &main);
+        let dir = bench.dir.path().join("broken");
+        fs::create_dir_all(dir.join("noop/src")).unwrap();
+        let noop = "[package]\nname = \"noop\"\nedition = \"2024\"\n[lib]\nproc-macro = true\n";
+        fs::write(dir.join("noop/Cargo.toml"), noop).unwrap();
+        let source = "#[proc_macro]\npub fn noop(_: proc_macro::TokenStream) -> proc_macro::TokenStream { Default::default() }\n";
+        fs::write(dir.join("noop/src/lib.rs"), source).unwrap();
+        let mut cargo = fs::read_to_string(dir.join("Cargo.toml")).unwrap();
+        cargo.push_str("members = [\"noop\"]\n[dependencies]\nnoop = { path = \"noop\" }\n");
+        fs::write(dir.join("Cargo.toml"), cargo).unwrap();
+    };
+    let table = [
+        ("", "", false),
+        ("hosts: { here: { local: true } }", "", false),
+        ("hosts: { here: { local: true, engine: docker } }", "", true),
+        (
+            "hosts: { here: { local: true, address: 10.0.0.1 }, far: { ssh: x@10.0.0.2 } }\n\
+             security: trusted-network\ndefaults: { host: here }",
+            "host: far",
+            true,
+        ),
+    ];
+    let target = tempfile::tempdir().unwrap();
+    for (hosts, more, portable) in table {
+        let bench = Bench::new(&manifest.replace("HOSTS", hosts).replace("MORE", more));
+        describe(&bench);
+        let options = CheckOptions {
+            target_dir: Some(target.path().to_owned()),
+            release: false,
+            ..CheckOptions::default()
+        };
+        let checked = bench.check(&options).unwrap_or_else(|p| panic!("{p}"));
+        for run in &checked.federates {
+            assert_eq!(run.portable, portable, "{hosts}");
+            assert_eq!(has_interpreter(&run.executable), !portable, "{hosts}");
+        }
+        assert_eq!(
+            checked.one_program.as_ref(),
+            Some(&checked.federates[0].executable)
+        );
+    }
 }
 
 /// Under centralized coordination nothing is asked and nothing is written into the plan; what can be solved is told.
@@ -280,7 +516,7 @@ fn without_build_nothing_runs() {
     };
     let checked = bench.check(&options).unwrap_or_else(|p| panic!("{p}"));
     assert!(checked.federates.is_empty());
-    assert_eq!(checked.plan.federates.len(), 4);
+    assert_eq!(checked.plan.federates.len(), 5);
 }
 
 /// Every `testdata/bad/NAME.yaml` gives the text of `NAME.txt`; `UPDATE=1` writes it anew.

@@ -30,6 +30,7 @@ fn request() -> StartRequest {
         kind: FederateKind::Ours,
         env: BTreeMap::new(),
         needs: ictus_deploy::Needs::default(),
+        portable: false,
     };
     StartRequest {
         manifest: PathBuf::from("/m/federation.yaml"),

@@ -214,6 +214,7 @@ mod tests {
             kind: FederateKind::Ours,
             env: BTreeMap::new(),
             needs: ictus_deploy::Needs::default(),
+            portable: false,
         };
         let request = StartRequest {
             manifest: "/f.yaml".into(),

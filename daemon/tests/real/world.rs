@@ -230,6 +230,7 @@ pub(crate) fn federation(members: &[(&str, &str)]) -> StartRequest {
         kind: FederateKind::Ours,
         env: BTreeMap::from([("FAKE".to_owned(), (*manner).to_owned())]),
         needs: ictus_deploy::Needs::default(),
+        portable: false,
     };
     StartRequest {
         manifest: PathBuf::from("/m/federation.yaml"),

@@ -66,3 +66,51 @@ pub(crate) enum OnFailureWord {
     /// They go on; nothing comes from it any more.
     Continue,
 }
+
+/// What runs a host's federates.
+#[derive(JsonSchema)]
+#[serde(rename_all = "lowercase")]
+#[schemars(inline)]
+#[expect(dead_code, reason = "only its schema is used")]
+pub(crate) enum EngineWord {
+    /// A process each.
+    Process,
+    /// A container each.
+    Docker,
+}
+
+/// Which program speaks ssh.
+#[derive(JsonSchema)]
+#[serde(rename_all = "lowercase")]
+#[schemars(inline)]
+#[expect(dead_code, reason = "only its schema is used")]
+pub(crate) enum SshClientWord {
+    /// Ictus itself.
+    Ssh2,
+    /// The system's `ssh`: security keys, certificates, all of ssh_config.
+    System,
+}
+
+/// What protects the messages between hosts.
+#[derive(JsonSchema)]
+#[serde(rename_all = "kebab-case")]
+#[schemars(inline)]
+#[expect(dead_code, reason = "only its schema is used")]
+pub(crate) enum SecurityWord {
+    /// Nothing but the network: whoever is on it can read and disturb.
+    TrustedNetwork,
+    /// Certificates; not there yet.
+    Mtls,
+}
+
+/// The kernel's realtime policies.
+#[derive(JsonSchema)]
+#[serde(rename_all = "kebab-case")]
+#[schemars(inline)]
+#[expect(dead_code, reason = "only its schema is used")]
+pub(crate) enum RealtimePolicyWord {
+    /// Runs until it waits.
+    Fifo,
+    /// Takes turns with those of its priority.
+    RoundRobin,
+}
