@@ -209,7 +209,7 @@ impl ExitReason {
                 Ok(exit::STP_VIOLATIONS) => Self::StpViolations,
                 Ok(_) | Err(_) => Self::Failed,
             },
-            Ending::Killed { .. } => Self::Killed,
+            Ending::Killed { .. } | Ending::OutOfMemory => Self::Killed,
             Ending::NotStarted { .. } => Self::NotStarted,
             Ending::Unknown => Self::Unknown,
         }

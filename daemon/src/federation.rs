@@ -5,6 +5,7 @@ use std::io;
 use std::net::{SocketAddr, SocketAddrV4};
 use std::time::Duration;
 
+use ictus_deploy::Engine;
 use tokio::sync::{broadcast, mpsc, oneshot, watch};
 use tokio::time::{Instant, sleep_until};
 
@@ -12,6 +13,7 @@ use crate::agent::{Action, Agent, MemberId, Now, RTI};
 use crate::api::{
     Event, FederationMeasures, FederationView, Happening, MemberView, Outcome, StartRequest, State,
 };
+use crate::docker::ContainerSpec;
 use crate::identity::random_id;
 use crate::paths::Paths;
 use crate::stamp;
@@ -20,10 +22,12 @@ use crate::supervisor::log_path;
 use crate::supervisor::protocol::StopSignal;
 use crate::supervisor::spec::PROTOCOL;
 
-mod launch;
+pub(crate) mod container;
+pub(crate) mod launch;
 mod link;
 mod order;
 
+use container::Contained;
 use launch::Run;
 use link::{Heard, Link, Origin};
 use order::Order;
@@ -259,8 +263,8 @@ impl Federation {
                             ..
                         }
                 );
-                if undone && let Err(error) = self.directory.undo() {
-                    tracing::warn!(%error, "not everything was undone");
+                if undone {
+                    self.undo().await;
                 }
                 return;
             }
@@ -287,6 +291,24 @@ impl Federation {
                 }
             }
         }
+    }
+
+    /// Removes what a start that failed has made.
+    async fn undo(&self) {
+        if self.in_containers() {
+            let swept = container::sweep(&self.record.view.name, Some(&self.record)).await;
+            if let Err(error) = swept {
+                tracing::warn!(%error, "perhaps containers or images were left");
+            }
+        }
+        if let Err(error) = self.directory.undo() {
+            tracing::warn!(%error, "not everything was undone");
+        }
+    }
+
+    fn in_containers(&self) -> bool {
+        let part = self.request.part.as_ref();
+        part.is_some_and(|part| part.engine == Engine::Docker)
     }
 
     fn handle_all(&mut self) {
@@ -344,13 +366,8 @@ impl Federation {
         for (member, rti_port) in launches {
             match random_id() {
                 Ok(instance) => {
-                    let socket = self.paths.supervisor_socket(&instance);
-                    let supervised = Supervised {
-                        instance,
-                        socket,
-                        supervisor: None,
-                    };
                     let name = member_name(&self.request, member).to_owned();
+                    let supervised = self.supervised(&name, instance);
                     self.record.members.insert(name.clone(), supervised.clone());
                     ready.push((member, name, rti_port, supervised));
                 }
@@ -370,11 +387,39 @@ impl Federation {
         }
     }
 
+    /// What is recorded of a supervisor before it is started.
+    fn supervised(&self, member: &str, instance: String) -> Supervised {
+        let docker = self.in_containers();
+        let container =
+            docker.then(|| ContainerSpec::name_of(&self.record.view.name, member, &instance));
+        let socket = if docker {
+            self.paths.contained_socket(&instance)
+        } else {
+            self.paths.supervisor_socket(&instance)
+        };
+        Supervised {
+            instance,
+            socket,
+            container,
+            supervisor: None,
+        }
+    }
+
     fn link(&mut self, member: MemberId, name: &str, supervised: &Supervised, origin: Origin) {
         self.order.expect(member);
         let (signal, signals) = mpsc::channel(SIGNALS_MAX);
         self.links.insert(member, signal);
+        let run = Run {
+            paths: &self.paths,
+            directory: &self.directory,
+            request: &self.request,
+            record: &self.record,
+        };
         let link = Link {
+            contained: Contained::of(&run, member, supervised),
+            handle: None,
+            supervisor: None,
+            child: None,
             member,
             socket: supervised.socket.clone(),
             spec: self.directory.spec(name),

@@ -241,6 +241,7 @@ impl Host {
         }
         self.check_driven(name)?;
         self.listeners().release(name);
+        self.remove_containers(name).await?;
         let kept = self
             .directory(name)
             .remove(purge)

@@ -24,9 +24,26 @@ impl ProcessIdentity {
     /// # Errors
     /// When there is no such process, or it belongs to another user.
     pub fn of(pid: u32) -> io::Result<Self> {
+        let pid_namespace = fs::metadata(format!("/proc/{pid}/ns/pid"))?.ino();
+        Self::in_namespace(pid, pid_namespace)
+    }
+
+    /// Reads the identity of a living process that says of itself in which namespace it is: another user's is not told.
+    ///
+    /// # Errors
+    /// When there is no such process.
+    pub(crate) fn seen(pid: u32, said: u64) -> io::Result<Self> {
+        match Self::of(pid) {
+            Err(error) if error.kind() == io::ErrorKind::PermissionDenied => {
+                Self::in_namespace(pid, said)
+            }
+            read => read,
+        }
+    }
+
+    fn in_namespace(pid: u32, pid_namespace: u64) -> io::Result<Self> {
         let stat = fs::read_to_string(format!("/proc/{pid}/stat"))?;
         let start_time = start_time(&stat).ok_or(io::ErrorKind::InvalidData)?;
-        let pid_namespace = fs::metadata(format!("/proc/{pid}/ns/pid"))?.ino();
         Ok(Self {
             pid,
             start_time,

@@ -10,6 +10,7 @@ pub mod api;
 pub mod blobs;
 pub mod client;
 pub mod daemon;
+mod docker;
 mod facts;
 mod federation;
 mod files;

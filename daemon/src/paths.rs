@@ -167,6 +167,12 @@ impl Paths {
         self.run.join(format!("{instance}.sock"))
     }
 
+    /// The socket of a supervisor in a container: in a directory of its own, which the container sees.
+    #[must_use]
+    pub fn contained_socket(&self, instance: &str) -> PathBuf {
+        self.run.join(instance).join("s")
+    }
+
     /// The directory of programs that were sent, by their SHA-256.
     #[must_use]
     pub fn blobs(&self) -> PathBuf {

@@ -6,8 +6,11 @@ use std::net::SocketAddrV4;
 use std::os::unix::net::UnixStream;
 use std::path::PathBuf;
 
+use ictus_deploy::Engine;
+
 use crate::agent::RTI;
 use crate::api::{Event, FederationView, MemberView, State};
+use crate::docker::ContainerSpec;
 use crate::stamp;
 use crate::store::{Directory, Record, Supervised};
 use crate::supervisor::spec::{PROTOCOL, Spec};
@@ -24,9 +27,15 @@ pub(crate) fn record(name: &str, directory: &Directory) -> Option<Record> {
             let mut args = spec.args.iter().skip_while(|arg| *arg != "-i");
             id = args.nth(1).cloned().unwrap_or_default();
         }
+        let docker = request
+            .part
+            .as_ref()
+            .is_some_and(|part| part.engine == Engine::Docker);
+        let container = docker.then(|| ContainerSpec::name_of(name, &spec.name, &spec.instance));
         let supervised = Supervised {
             instance: spec.instance,
             socket: spec.socket,
+            container,
             supervisor: None,
         };
         members.insert(spec.name, supervised);

@@ -38,13 +38,16 @@ pub struct Record {
 }
 
 /// A supervisor that was started.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Supervised {
     /// The random id it answers with.
     pub instance: String,
     /// Where it listens.
     pub socket: PathBuf,
-    /// The process, once it has answered.
+    /// The container whose first process it is, by name (engine docker).
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub container: Option<String>,
+    /// The process as this host sees it, once it has answered.
     pub supervisor: Option<ProcessIdentity>,
 }
 

@@ -9,12 +9,15 @@
 //! - the daemon dies: nothing changes;
 //! - SIGTERM or SIGINT at the supervisor is passed on to the federate.
 
+use std::fs::Permissions;
 use std::io;
 use std::os::fd::{AsFd, OwnedFd};
+use std::os::unix::fs::{MetadataExt, PermissionsExt};
 use std::os::unix::net::{UnixListener, UnixStream};
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
+use nix::sys::socket::sockopt::PeerCredentials;
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 
 use crate::identity::ProcessIdentity;
@@ -70,9 +73,11 @@ pub enum SuperviseError {
 /// # Errors
 /// See [`SuperviseError`]. That the process could not be started, or failed, is no error: the exit record says so.
 pub fn run(spec: &Path) -> Result<(), SuperviseError> {
-    let spec = Spec::read(spec)?;
     let system = |what| move |source| SuperviseError::System { what, source };
-    let mut supervisor = Supervisor::listen(spec).map_err(system("listen"))?;
+    let owner = std::fs::metadata(spec).map(|file| file.uid());
+    let spec = Spec::read(spec)?;
+    let owner = owner.map_err(system("look at the spec"))?;
+    let mut supervisor = Supervisor::listen(spec, owner).map_err(system("listen"))?;
     announce().map_err(system("report readiness"))?;
     let socket = supervisor.spec.socket.clone();
     supervisor.start();
@@ -90,10 +95,14 @@ fn announce() -> io::Result<()> {
 
 struct Supervisor {
     spec: Spec,
+    /// Who wrote the spec: in a container the supervisor may run as somebody else.
+    owner: u32,
     own: ProcessIdentity,
     listener: UnixListener,
     /// SIGTERM and SIGINT arrive here as bytes.
     signals: UnixStream,
+    /// So does that a child has ended, which may be an orphan that became ours.
+    children: UnixStream,
     log: Log,
     statuses: Lines,
     process: Option<Process>,
@@ -121,6 +130,7 @@ enum Phase {
 enum Watched {
     Listener,
     Signals,
+    Children,
     End,
     Pipe(Pipe),
     Client(usize),
@@ -135,7 +145,7 @@ enum Pipe {
 }
 
 impl Supervisor {
-    fn listen(spec: Spec) -> io::Result<Self> {
+    fn listen(spec: Spec, owner: u32) -> io::Result<Self> {
         // Fails only for a group leader, which a shell makes of us; then the session is its own already.
         match rustix::process::setsid() {
             Ok(_) | Err(_) => {}
@@ -143,16 +153,24 @@ impl Supervisor {
         rustix::process::set_child_subreaper(Some(rustix::process::getpid()))?;
         let log = Log::open(&spec.log, spec.log_size_max, spec.log_files_max)?;
         let listener = UnixListener::bind(&spec.socket)?;
+        if owner != rustix::process::geteuid().as_raw() {
+            // The directory is private to both.
+            std::fs::set_permissions(&spec.socket, Permissions::from_mode(0o666))?;
+        }
         listener.set_nonblocking(true)?;
         let (signals, writer) = UnixStream::pair()?;
         signals.set_nonblocking(true)?;
         for signal in [signal_hook::consts::SIGTERM, signal_hook::consts::SIGINT] {
             signal_hook::low_level::pipe::register(signal, writer.try_clone()?)?;
         }
+        let (children, writer) = UnixStream::pair()?;
+        children.set_nonblocking(true)?;
+        signal_hook::low_level::pipe::register(signal_hook::consts::SIGCHLD, writer)?;
         Ok(Self {
             own: ProcessIdentity::own()?,
             listener,
             signals,
+            children,
             log,
             statuses: Lines::new(STATUS_BYTES_MAX),
             process: None,
@@ -160,6 +178,7 @@ impl Supervisor {
             history: History::default(),
             clients: Vec::new(),
             phase: Phase::Running,
+            owner,
             spec,
         })
     }
@@ -237,6 +256,10 @@ impl Supervisor {
                 PollFd::new(&self.listener, PollFlags::IN),
             ),
             (Watched::Signals, PollFd::new(&self.signals, PollFlags::IN)),
+            (
+                Watched::Children,
+                PollFd::new(&self.children, PollFlags::IN),
+            ),
         ];
         if let Some(process) = &self.process {
             if matches!(self.phase, Phase::Running) {
@@ -279,7 +302,7 @@ impl Supervisor {
         let mut ready: Vec<_> = ready.map(|(name, _)| name).collect();
         ready.sort_by_key(|watched| match watched {
             Watched::Pipe(_) => (0, 0),
-            Watched::End | Watched::Signals => (1, 0),
+            Watched::End | Watched::Signals | Watched::Children => (1, 0),
             Watched::Client(index) => (2, usize::MAX - index),
             Watched::Listener => (3, 0),
         });
@@ -290,6 +313,7 @@ impl Supervisor {
         match watched {
             Watched::Listener => self.accept(),
             Watched::Signals => self.pass_signal_on(),
+            Watched::Children => self.reap_orphans(),
             Watched::Pipe(pipe) => self.read_pipe(pipe),
             Watched::End => self.reap(),
             Watched::Client(index) => {
@@ -304,8 +328,10 @@ impl Supervisor {
         let Ok((stream, _)) = self.listener.accept() else {
             return;
         };
-        let ours = rustix::net::sockopt::socket_peercred(&stream)
-            .is_ok_and(|peer| peer.uid == rustix::process::geteuid());
+        // Not rustix's: from a container's inside the daemon's pid is 0, which its type does not hold.
+        let ours = nix::sys::socket::getsockopt(&stream, PeerCredentials).is_ok_and(|peer| {
+            [self.owner, rustix::process::geteuid().as_raw()].contains(&peer.uid())
+        });
         if ours && self.clients.len() < CLIENTS_MAX {
             self.clients.extend(Client::new(stream));
         }
@@ -319,6 +345,14 @@ impl Supervisor {
         {
             self.log
                 .remark(&format!("cannot pass a signal on: {error}"));
+        }
+    }
+
+    /// Orphans that have ended would count as processes of their container until the federate ends.
+    fn reap_orphans(&mut self) {
+        let mut bytes = [0; 64];
+        if rustix::io::read(&self.children, &mut bytes).is_ok() {
+            process::reap_orphans(self.process.as_ref().map(Process::pid));
         }
     }
 

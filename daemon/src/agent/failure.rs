@@ -52,7 +52,10 @@ impl Agent {
             },
             Ending::Killed { signal: 15 } if signalled.is_some() => None,
             Ending::Killed { signal: 9 } if signalled == Some(StopSignal::Kill) => None,
-            Ending::Killed { .. } | Ending::NotStarted { .. } | Ending::Unknown => Some(0),
+            Ending::Killed { .. }
+            | Ending::OutOfMemory
+            | Ending::NotStarted { .. }
+            | Ending::Unknown => Some(0),
         }
     }
 

@@ -41,7 +41,12 @@ pub(crate) fn spec(
         MemberId::Federate(index) => Some(&request.federates[usize::from(index)]),
     };
     let name = federate.map_or(RTI, |run| &run.name).to_owned();
-    let mut env = passed_on();
+    // What the host's HOME and PATH say is of no use in a container.
+    let mut env = if supervised.container.is_some() {
+        BTreeMap::new()
+    } else {
+        passed_on()
+    };
     let (program, args) = if let Some(federate) = federate {
         env.extend(federate.env.clone());
         (
@@ -96,7 +101,7 @@ impl Run<'_> {
     }
 
     /// What a federate executes: a blob that was sent, or the path of the manifest.
-    fn executable(&self, federate: &FederateRun) -> PathBuf {
+    pub(super) fn executable(&self, federate: &FederateRun) -> PathBuf {
         let part = self.request.part.as_ref();
         let blob = part.and_then(|part| part.programs.get(&federate.name));
         blob.map_or_else(

@@ -12,17 +12,21 @@ use tokio::net::unix::{OwnedReadHalf, OwnedWriteHalf};
 use tokio::sync::mpsc;
 use tokio::time::timeout;
 
+use super::container::{Contained, ContainerError, Found, Handle, host_pid, see};
 use super::launch;
 use crate::agent::{MemberEvent, MemberId};
+use crate::host::with_sources;
 use crate::identity::ProcessIdentity;
 use crate::supervisor::READY;
-use crate::supervisor::exit::ExitRecord;
+use crate::supervisor::exit::{Ending, ExitRecord};
 use crate::supervisor::protocol::{Reply, Request, StopSignal};
 use crate::supervisor::spec::{PROTOCOL, Spec};
 use crate::{process, stamp};
 
 /// How long a supervisor may take to listen, to answer, and to end after its release.
 const ANSWER_MAX: Duration = Duration::from_secs(10);
+/// What the kernel sends when memory is used up, among others.
+const SIGKILL: i32 = 9;
 /// What is kept of a supervisor's own complaint.
 const COMPLAINT_BYTES_MAX: u64 = 4096;
 
@@ -30,6 +34,14 @@ const COMPLAINT_BYTES_MAX: u64 = 4096;
 #[derive(Debug)]
 pub(crate) struct Link {
     pub(crate) member: MemberId,
+    /// The container whose first process the supervisor is, if it is in one.
+    pub(crate) contained: Option<Contained>,
+    /// The same, once it is made or found.
+    pub(crate) handle: Option<Handle>,
+    /// The supervisor, once it is known.
+    pub(crate) supervisor: Option<ProcessIdentity>,
+    /// The member's pid as it was told, and as this host knows it.
+    pub(crate) child: Option<(u32, u32)>,
     pub(crate) instance: String,
     pub(crate) socket: PathBuf,
     pub(crate) spec: PathBuf,
@@ -91,6 +103,7 @@ impl Link {
         match connected {
             Ok(connection) => {
                 let supervisor = connection.supervisor;
+                self.supervisor = Some(supervisor);
                 let identified = Heard::Identified {
                     member: self.member,
                     supervisor,
@@ -98,14 +111,22 @@ impl Link {
                 self.hear.send(identified).await.ok();
                 self.follow(connection).await;
             }
-            Err(Failed::NotSupervised(why)) => self.say(MemberEvent::NotSupervised { why }).await,
+            Err(Failed::NotSupervised(why)) => {
+                self.clean().await;
+                self.say(MemberEvent::NotSupervised { why }).await;
+            }
             Err(Failed::Foreign(why)) => self.say(MemberEvent::Foreign { why }).await,
             Err(Failed::Nobody) => self.say_from_record().await,
         }
         self.caught_up().await;
     }
 
-    async fn launch(&self, spec: &Spec) -> Result<Connection, Failed> {
+    async fn launch(&mut self, spec: &Spec) -> Result<Connection, Failed> {
+        if let Some(contained) = &self.contained {
+            let launched = contained.launch(spec, &self.spec).await;
+            self.handle = Some(launched.map_err(|error| not_supervised(&error))?);
+            return self.connect(None).await;
+        }
         let failed = |what: &str, error: &dyn std::fmt::Display| {
             Failed::NotSupervised(format!("{what}: {error}"))
         };
@@ -134,7 +155,25 @@ impl Link {
         })
     }
 
-    async fn adopt(&self, recorded: Option<ProcessIdentity>) -> Result<Connection, Failed> {
+    async fn adopt(&mut self, recorded: Option<ProcessIdentity>) -> Result<Connection, Failed> {
+        if let Some(contained) = &self.contained {
+            match contained.find().await {
+                Ok(Found::Own(handle)) => self.handle = Some(handle),
+                Ok(Found::Nothing) => return Err(Failed::Nobody),
+                Ok(Found::Foreign) => {
+                    return Err(Failed::Foreign(
+                        "its container has another instance id".to_owned(),
+                    ));
+                }
+                // What listens is still known by its process, if something does.
+                Err(error) => tracing::warn!(%error, "a container is adopted without its engine"),
+            }
+            // A supervisor that does not answer is gone; its exit record tells.
+            return self.connect(recorded).await.map_err(|failed| match failed {
+                Failed::NotSupervised(_) => Failed::Nobody,
+                other @ (Failed::Foreign(_) | Failed::Nobody) => other,
+            });
+        }
         let connection = self.connect(recorded).await;
         if matches!(connection, Err(Failed::Nobody)) {
             // Killed: it could not remove its socket. The name is random, so it is ours.
@@ -145,9 +184,15 @@ impl Link {
 
     /// Connects and makes sure that who answers is the recorded supervisor.
     async fn connect(&self, recorded: Option<ProcessIdentity>) -> Result<Connection, Failed> {
-        let stream = UnixStream::connect(&self.socket)
-            .await
-            .map_err(|_| Failed::Nobody)?;
+        let stream = match &self.handle {
+            Some(handle) => handle
+                .connect(&self.socket, ANSWER_MAX)
+                .await
+                .map_err(|error| not_supervised(&error))?,
+            None => UnixStream::connect(&self.socket)
+                .await
+                .map_err(|_| Failed::Nobody)?,
+        };
         let peer = stream.peer_cred().ok();
         let peer = peer.map(|peer| {
             (
@@ -179,11 +224,22 @@ impl Link {
         if instance != self.instance {
             return foreign("its supervisor has another instance id");
         }
-        if recorded.is_some_and(|recorded| recorded != supervisor) || !supervisor.lives() {
+        let supervisor = if self.contained.is_some() {
+            let pid = peer.and_then(|(_, pid)| pid);
+            self.identify(pid, supervisor, recorded).await?
+        } else {
+            supervisor
+        };
+        if recorded.is_some_and(|recorded| recorded != supervisor)
+            || (self.contained.is_none() && !supervisor.lives())
+        {
             return foreign("its supervisor is another process than the record's");
         }
         let own = rustix::process::geteuid().as_raw();
-        if peer != Some((own, Some(supervisor.pid))) {
+        let named = self.contained.as_ref().is_some_and(Contained::has_user);
+        if peer.map(|(_, pid)| pid) != Some(Some(supervisor.pid))
+            || (!named && peer.map(|(uid, _)| uid) != Some(own))
+        {
             return foreign("its supervisor is another process than it says");
         }
         // The status is asked for because its answer comes after everything that happened before.
@@ -199,6 +255,28 @@ impl Link {
         })
     }
 
+    /// In a container a supervisor knows itself by another pid than this host does.
+    async fn identify(
+        &self,
+        pid: Option<u32>,
+        claimed: ProcessIdentity,
+        recorded: Option<ProcessIdentity>,
+    ) -> Result<ProcessIdentity, Failed> {
+        let foreign = |why: &str| Failed::Foreign(why.to_owned());
+        let pid = pid.ok_or_else(|| foreign("its supervisor cannot be seen from here"))?;
+        let seen = see(pid, claimed).map_err(|why| foreign(&why))?;
+        match &self.handle {
+            Some(handle) if !handle.begins_with(pid).await.map_err(|why| foreign(&why))? => Err(
+                foreign("its supervisor is not the first process of its container"),
+            ),
+            // Without the engine only the record tells.
+            None if recorded != Some(seen) => Err(foreign(
+                "its supervisor is another process than the record's",
+            )),
+            Some(_) | None => Ok(seen),
+        }
+    }
+
     async fn follow(&mut self, mut connection: Connection) {
         let pidfd = process::open(connection.supervisor.pid);
         loop {
@@ -210,6 +288,7 @@ impl Link {
                         if let Some(pidfd) = pidfd {
                             process::wait_for_end(pidfd, ANSWER_MAX).await;
                         }
+                        self.clean().await;
                         return self.say(MemberEvent::Closed).await;
                     }
                 }
@@ -223,11 +302,17 @@ impl Link {
     }
 
     /// Passes a reply on; true when nothing follows it.
-    async fn pass(&self, line: &str) -> bool {
+    async fn pass(&mut self, line: &str) -> bool {
         let (at_ns, event, last) = match serde_json::from_str(line) {
-            Ok(Reply::Started { pid, at_ns }) => (at_ns, MemberEvent::Started { pid }, false),
+            Ok(Reply::Started { pid, at_ns }) => {
+                let pid = self.known_here(pid);
+                (at_ns, MemberEvent::Started { pid }, false)
+            }
             Ok(Reply::Reported { at_ns, line }) => (at_ns, MemberEvent::Reported { line }, false),
-            Ok(Reply::Ended { record }) => (record.ended_ns, MemberEvent::Ended { record }, true),
+            Ok(Reply::Ended { record }) => {
+                let record = self.complete(record).await;
+                (record.ended_ns, MemberEvent::Ended { record }, true)
+            }
             Ok(Reply::Refused { why }) => {
                 tracing::debug!(member = ?self.member, why, "refused");
                 return false;
@@ -253,8 +338,13 @@ impl Link {
 
     /// The supervisor is gone: its exit record tells, if it wrote one.
     async fn say_from_record(&self) {
-        if let Some(record) = ExitRecord::read(&self.exit_record, &self.instance) {
-            let (at_ns, record) = (record.ended_ns, Box::new(record));
+        let record = match ExitRecord::read(&self.exit_record, &self.instance) {
+            Some(record) => Some(self.complete(Box::new(record)).await),
+            None => self.without_record().await,
+        };
+        self.clean().await;
+        if let Some(record) = record {
+            let at_ns = record.ended_ns;
             let event = MemberEvent::Ended { record };
             self.hear
                 .send(Heard::Event {
@@ -266,6 +356,61 @@ impl Link {
                 .ok();
         }
         self.say(MemberEvent::Closed).await;
+    }
+
+    /// The pid by which this host knows the member.
+    fn known_here(&mut self, pid: u32) -> u32 {
+        let first = self.supervisor.filter(|_| self.contained.is_some());
+        let here = first
+            .and_then(|first| host_pid(first.pid, pid))
+            .unwrap_or(pid);
+        self.child = Some((pid, here));
+        here
+    }
+
+    /// Adds to a record what only the container's owner knows.
+    async fn complete(&self, mut record: Box<ExitRecord>) -> Box<ExitRecord> {
+        if let Some((_, here)) = self.child.filter(|(inside, _)| record.pid == Some(*inside)) {
+            record.pid = Some(here);
+        }
+        let killed = record.ending == Ending::Killed { signal: SIGKILL };
+        if killed
+            && let Some(handle) = &self.handle
+            && handle.out_of_memory().await
+        {
+            record.ending = Ending::OutOfMemory;
+        }
+        record
+    }
+
+    /// The supervisor could not write a record: that its memory was used up is known all the same.
+    async fn without_record(&self) -> Option<Box<ExitRecord>> {
+        let handle = self.handle.as_ref()?;
+        handle.out_of_memory().await.then(|| {
+            Box::new(ExitRecord {
+                protocol: PROTOCOL,
+                instance: self.instance.clone(),
+                name: String::new(),
+                pid: self.child.map(|(_, here)| here),
+                started_ns: 0,
+                ended_ns: stamp::now_ns(),
+                ending: Ending::OutOfMemory,
+                last_status: None,
+                reports: Vec::new(),
+                first_lines: Vec::new(),
+                log_lines_lost: 0,
+            })
+        })
+    }
+
+    /// Removes the container, and its socket's directory.
+    async fn clean(&self) {
+        if let Some(handle) = &self.handle {
+            handle.remove().await;
+        }
+        if let Some(contained) = &self.contained {
+            contained.remove_socket();
+        }
     }
 
     async fn caught_up(&self) {
@@ -281,6 +426,10 @@ impl Link {
         };
         self.hear.send(heard).await.ok();
     }
+}
+
+fn not_supervised(error: &ContainerError) -> Failed {
+    Failed::NotSupervised(with_sources(error))
 }
 
 fn supervise(spec: &Path) -> tokio::process::Command {

@@ -4,12 +4,16 @@ use std::collections::BTreeSet;
 use std::io::Read;
 use std::net::{Ipv4Addr, SocketAddrV4, TcpListener};
 
+use ictus_deploy::Engine;
+
+use crate::agent::MemberId;
 use crate::api::part::{
     CommitRequest, Lease, LeaseRequest, LeaseView, Part, PrepareRequest, Prepared,
 };
 use crate::api::{ApiError, ErrorCode, State};
 use crate::blobs::{BlobError, Blobs};
-use crate::federation::{Federation, Handle};
+use crate::federation::launch::Run;
+use crate::federation::{Federation, Handle, container};
 use crate::files;
 use crate::leases::{LeaseError, Leases};
 use crate::stamp;
@@ -148,6 +152,56 @@ impl Host {
         })
     }
 
+    /// Makes the images of a prepared part whose engine is Docker.
+    pub(crate) async fn prepare_images(&self, name: &str) -> Result<(), ApiError> {
+        let directory = self.directory(name);
+        let failed = |error: &dyn std::error::Error| error_of(with_sources(error));
+        let request = directory.read_request().map_err(|e| failed(&e))?;
+        let Some(part) = request
+            .part
+            .as_ref()
+            .filter(|part| part.engine == Engine::Docker)
+        else {
+            return Ok(());
+        };
+        let Some(record) = directory.read_record().map_err(|e| failed(&e))? else {
+            return Ok(());
+        };
+        let run = Run {
+            paths: self.paths(),
+            directory: &directory,
+            request: &request,
+            record: &record,
+        };
+        let federates = part.federates.iter().map(|id| MemberId::Federate(*id));
+        let members: Vec<_> = part
+            .rti
+            .then_some(MemberId::Rti)
+            .into_iter()
+            .chain(federates)
+            .collect();
+        container::prepare(&run, &members).await.map_err(|error| {
+            let host = &part.host;
+            error_of(format!("host `{host}`: {}", with_sources(&error)))
+        })
+    }
+
+    /// Removes the containers and images that a run left.
+    pub(super) async fn remove_containers(&self, name: &str) -> Result<(), ApiError> {
+        let directory = self.directory(name);
+        let part = directory
+            .read_request()
+            .ok()
+            .and_then(|request| request.part);
+        if part.is_none_or(|part| part.engine != Engine::Docker) {
+            return Ok(());
+        }
+        let record = recorded(name, &directory).map_err(|error| store_error(&error))?;
+        container::sweep(name, record.as_ref())
+            .await
+            .map_err(|error| error_of(format!("federation `{name}` leaves containers: {error}")))
+    }
+
     /// Begins what was prepared.
     pub(crate) fn commit(&self, name: &str, commit: &CommitRequest) -> Result<Handle, ApiError> {
         self.check_fence(name, Some(commit.fence))?;
@@ -277,6 +331,10 @@ fn blob_error(blob: &BlobError) -> ApiError {
         BlobError::Io { .. } => ErrorCode::Failed,
     };
     error(code, with_sources(blob))
+}
+
+fn error_of(message: String) -> ApiError {
+    error(ErrorCode::Failed, message)
 }
 
 fn error(code: ErrorCode, message: String) -> ApiError {

@@ -16,6 +16,7 @@ use crate::api::part::{
     CommitRequest, HostFacts, Lease, LeaseRequest, LeaseView, PrepareRequest, Prepared,
 };
 use crate::api::{ApiError, ErrorCode};
+use crate::docker::Engine;
 use crate::facts;
 use crate::host::Host;
 
@@ -57,7 +58,10 @@ struct BlobQuery {
 }
 
 async fn host_facts(State(host): State<Host>) -> Json<HostFacts> {
-    let docker = Err("this daemon does not use Docker".to_owned());
+    let docker = Engine::connect().await;
+    let docker = docker
+        .map(|engine| engine.facts().clone())
+        .map_err(|error| error.to_string());
     Json(facts::of_this_host(host.paths(), docker))
 }
 
@@ -166,7 +170,10 @@ pub(super) async fn prepare(
     body: Bytes,
 ) -> Result<Json<Prepared>, ApiError> {
     let request: PrepareRequest = parse(&body)?;
-    host.prepare(&name, query.fence, &request).map(Json)
+    let prepared = host.prepare(&name, query.fence, &request)?;
+    // Afterwards, because only then everything that it needs is known to be there.
+    host.prepare_images(&name).await?;
+    Ok(Json(prepared))
 }
 
 async fn commit(

@@ -53,6 +53,8 @@ pub enum Ending {
         /// The signal's number.
         signal: i32,
     },
+    /// The kernel killed it because the memory of its container was used up. Only who owns the container knows.
+    OutOfMemory,
     /// It was never started.
     NotStarted {
         /// Why.
@@ -79,6 +81,9 @@ impl Ending {
         match self {
             Self::Exited { code } => format!("exit code {code}"),
             Self::Killed { signal } => format!("killed by {}", signal_name(*signal)),
+            Self::OutOfMemory => {
+                "killed by the kernel: its memory limit (`memory:`) was used up".to_owned()
+            }
             Self::NotStarted { why } => format!("could not be started: {why}"),
             Self::Unknown => "vanished together with its supervisor".to_owned(),
         }

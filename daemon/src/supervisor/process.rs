@@ -153,6 +153,17 @@ pub(crate) fn kill_orphans() {
     }
 }
 
+/// Takes the exit statuses of children that have ended, but not of this one, which is waited for.
+pub(crate) fn reap_orphans(but: Option<u32>) {
+    let but = but.and_then(|pid| Pid::from_raw(i32::try_from(pid).ok()?));
+    for pid in own_children().into_iter().filter(|pid| Some(*pid) != but) {
+        // One that lives on is asked again when it ends.
+        match rustix::process::waitpid(Some(pid), WaitOptions::NOHANG) {
+            Ok(_) | Err(_) => {}
+        }
+    }
+}
+
 fn wait_readable(pidfd: &OwnedFd) {
     let mut fds = [rustix::event::PollFd::new(
         pidfd,

@@ -216,6 +216,34 @@ fn federate(options: &BTreeMap<String, String>) -> ExitCode {
             println!("stdin had {read} lines");
             ExitCode::SUCCESS
         }
+        "zombie" => {
+            // The child's child outlives it and ends at once.
+            let own = std::env::current_exe().unwrap();
+            let child = Command::new(own)
+                .arg("federate")
+                .env("FAKE", "parent")
+                .status();
+            assert!(child.unwrap().success());
+            loop {
+                thread::park();
+            }
+        }
+        "parent" => {
+            let own = std::env::current_exe().unwrap();
+            let child = Command::new(own)
+                .arg("federate")
+                .env("FAKE", "env")
+                .spawn()
+                .unwrap();
+            println!("orphan {}", child.id());
+            ExitCode::SUCCESS
+        }
+        "fill" => {
+            let mut kept = Vec::new();
+            loop {
+                kept.push(vec![1_u8; 1 << 20]);
+            }
+        }
         "orphan" => {
             let own = std::env::current_exe().unwrap();
             let child = Command::new(own)

@@ -8,6 +8,7 @@
 )]
 
 mod daemon;
+mod docker;
 mod metrics;
 mod parts;
 mod supervisor;

@@ -233,3 +233,22 @@ fn orphans_are_killed() {
         .1;
     assert!(!PathBuf::from(format!("/proc/{orphan}")).exists());
 }
+
+/// In a container nobody else would, and they would count against its limit of processes.
+#[test]
+fn orphans_that_end_are_reaped_while_the_process_runs() {
+    let mut it = Supervised::run("zombie");
+    let began = std::time::Instant::now();
+    loop {
+        // Answered after what the supervisor does about a child that has ended.
+        it.ask(Request::Status);
+        assert!(matches!(it.next(), Reply::Status { pid: Some(_), .. }));
+        let log = it.log();
+        let mut lines = log.lines();
+        let orphan = lines.find_map(|line| line.split_once("out orphan "));
+        if orphan.is_some_and(|(_, pid)| !PathBuf::from(format!("/proc/{pid}")).exists()) {
+            return;
+        }
+        assert!(began.elapsed() < BOUND, "{log}");
+    }
+}

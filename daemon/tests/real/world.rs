@@ -78,23 +78,45 @@ pub(crate) struct World {
     pub(crate) paths: Paths,
     pub(crate) daemon: Child,
     pub(crate) client: Client,
+    program: Program,
     _directory: TempDir,
+}
+
+/// What the daemon is, and where it finds its Docker engine.
+#[derive(Clone, Debug)]
+pub(crate) struct Program {
+    pub(crate) executable: PathBuf,
+    pub(crate) engine: Option<PathBuf>,
+}
+
+impl Default for Program {
+    fn default() -> Self {
+        Self {
+            executable: fakes().to_path_buf(),
+            engine: None,
+        }
+    }
 }
 
 impl World {
     pub(crate) async fn new() -> Self {
+        Self::of(Program::default()).await
+    }
+
+    pub(crate) async fn of(program: Program) -> Self {
         let directory = tempfile::tempdir().unwrap();
         let state = directory.path().join("ictus");
         let paths = Paths {
             run: state.join("run"),
             state,
         };
-        let daemon = spawn_daemon(&paths, "60000");
+        let daemon = spawn(&program, &paths, "60000");
         let client = Client::find(&paths).await.unwrap();
         Self {
             paths,
             daemon,
             client,
+            program,
             _directory: directory,
         }
     }
@@ -106,7 +128,7 @@ impl World {
     }
 
     pub(crate) async fn replace_daemon_after_end(&mut self) {
-        self.daemon = spawn_daemon(&self.paths, "60000");
+        self.daemon = spawn(&self.program, &self.paths, "60000");
         self.client = Client::find(&self.paths).await.unwrap();
     }
 
@@ -174,12 +196,19 @@ pub(crate) struct Started {
 }
 
 pub(crate) fn spawn_daemon(paths: &Paths, idle_ms: &str) -> Child {
-    let mut command = Command::new(fakes());
+    spawn(&Program::default(), paths, idle_ms)
+}
+
+fn spawn(program: &Program, paths: &Paths, idle_ms: &str) -> Child {
+    let mut command = Command::new(&program.executable);
     command
         .arg("daemon")
         .env_clear()
         .env("ICTUS_STATE_DIR", &paths.state);
     command.env(ictusd::daemon::IDLE_VARIABLE, idle_ms);
+    if let Some(engine) = &program.engine {
+        command.env("DOCKER_HOST", format!("unix://{}", engine.display()));
+    }
     if paths.run != paths.state.join("run") {
         // As a login session would: STATE is below its parent, RUN too.
         command.env_remove("ICTUS_STATE_DIR");
