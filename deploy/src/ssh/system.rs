@@ -15,7 +15,7 @@ use tokio::time::timeout;
 
 use super::Options;
 use super::error::SshError;
-use super::known_hosts::{Known, fingerprint_at};
+use super::known_hosts::{Known, fingerprint_at, known_name};
 use super::pipe::{End, STDERR_MAX};
 use super::route::{Route, jumps};
 use super::target::Target;
@@ -93,6 +93,8 @@ impl System {
     ) -> Result<Process, SshError> {
         let mut command = base(&self.target, &self.options);
         command
+            .arg("-o")
+            .arg(known_hosts_option(&self.route.known_hosts))
             .args(["-T", "--", &self.target.host])
             .args(line.split(' '));
         command.stdin(Stdio::piped());
@@ -130,7 +132,7 @@ impl System {
         }
         if let Some(line) = any(&["host key is known for", "Host key verification failed"]) {
             return Some(SshError::UnknownHostKey {
-                host,
+                host: self.known_name(),
                 kind: line
                     .split(' ')
                     .nth(1)
@@ -191,12 +193,16 @@ impl System {
         })
     }
 
+    fn known_name(&self) -> String {
+        known_name(&self.route.host, self.route.port)
+    }
+
     fn revoked(&self) -> SshError {
         let known = Known::read(&self.route.known_hosts, &self.route.host, self.route.port)
             .unwrap_or_default();
         let (file, line, fingerprint) = known.first_revoked().unwrap_or_default();
         SshError::Revoked {
-            host: self.route.name(),
+            host: self.known_name(),
             file,
             line,
             fingerprint,
@@ -218,7 +224,7 @@ impl System {
             .find(|word| word.starts_with("SHA256:"))
             .unwrap_or_default();
         SshError::HostKeyChanged {
-            host: self.route.name(),
+            host: self.known_name(),
             expected: fingerprint_at(&file, line).unwrap_or_default(),
             file,
             line,
@@ -281,10 +287,6 @@ fn base(target: &Target, options: &Options) -> Command {
     }
     let seconds = options.connect_timeout.as_secs().max(1);
     command.arg("-o").arg(format!("ConnectTimeout={seconds}"));
-    command.arg("-o").arg(format!(
-        "UserKnownHostsFile=\"{}\"",
-        options.known_hosts.display()
-    ));
     match &options.agent {
         Some(agent) => command.env("SSH_AUTH_SOCK", agent),
         None => command.env_remove("SSH_AUTH_SOCK"),
@@ -302,7 +304,11 @@ fn base(target: &Target, options: &Options) -> Command {
     if let Some(port) = target.port {
         command.arg("-p").arg(port.to_string());
     }
-    command.env("LC_ALL", "C").env_remove("SSH_ASKPASS");
+    // Whatever still wants to ask, such as an `ssh` to a host on the way, asks a program that fails.
+    command
+        .env("LC_ALL", "C")
+        .env("SSH_ASKPASS", "/bin/false")
+        .env("SSH_ASKPASS_REQUIRE", "force");
     command
         .stdout(Stdio::piped())
         .stderr(Stdio::piped())
@@ -334,10 +340,34 @@ fn route(target: &Target, options: &Options, text: &str) -> Result<Route, SshErr
         identities_named: false,
         only_identities: false,
         agent: options.agent.clone(),
-        known_hosts: vec![options.known_hosts.clone()],
+        known_hosts: known_hosts(value("userknownhostsfile").as_deref(), options),
         jumps: jumps(value("proxyjump").as_deref())
             .map_err(|_| bad("jump host that we understand"))?,
     })
+}
+
+/// The files that ssh_config names, if it does, and ours.
+fn known_hosts(value: Option<&str>, options: &Options) -> Vec<PathBuf> {
+    let named: Vec<&str> = value.unwrap_or_default().split(' ').collect();
+    // What `ssh` takes when nothing is said is not what somebody said.
+    let default = matches!(named[..], [one, two] if one.ends_with("/.ssh/known_hosts") && two.ends_with("/.ssh/known_hosts2"));
+    let named = named
+        .into_iter()
+        .filter(|name| !default && !name.is_empty() && *name != "none");
+    let mut files: Vec<PathBuf> = named.map(PathBuf::from).collect();
+    if !files.contains(&options.known_hosts) {
+        files.push(options.known_hosts.clone());
+    }
+    files
+}
+
+/// The files as an option of `ssh`, which would expand `%`.
+fn known_hosts_option(files: &[PathBuf]) -> String {
+    let quoted: Vec<String> = files
+        .iter()
+        .map(|file| format!("\"{}\"", file.display().to_string().replace('%', "%%")))
+        .collect();
+    format!("UserKnownHostsFile={}", quoted.join(" "))
 }
 
 /// Keeps the last bytes of a stream.

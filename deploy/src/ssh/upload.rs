@@ -29,7 +29,8 @@ impl Connection {
         mode: u32,
         progress: &mut (dyn FnMut(u64) + Send),
     ) -> Result<(), SshError> {
-        command_line(&["mv", to])?;
+        // As the first word it may not be an option either.
+        command_line(&[to])?;
         let file = File::open(from)
             .await
             .map_err(|error| local(from, &error))?;
