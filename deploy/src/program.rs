@@ -135,6 +135,10 @@ pub(crate) fn build(
         let triple = host_triple(&cargo, &dir)?;
         let (name, flags) = static_flags(&triple, &|name| std::env::var_os(name));
         command.arg("--target").arg(&triple).env(name, flags);
+        // It travels: what only a debugger reads stays here.
+        command
+            .env("CARGO_PROFILE_RELEASE_STRIP", "symbols")
+            .env("CARGO_PROFILE_RELEASE_DEBUG", "none");
     }
     if let Some(target_dir) = &options.target_dir {
         command.arg("--target-dir").arg(target_dir);
