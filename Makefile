@@ -19,5 +19,6 @@ build: setup
 run: build
 	@ICTUS=$(ICTUS) .ci/show compose/autoware/federation.yaml
 
-test: setup
+test:
+	@.ci/setup hosts
 	.ci/test

@@ -1,4 +1,4 @@
-//! What the end-to-end tests share: the `ictus` binary in a state directory of its own.
+//! What the end-to-end tests share: the `ictus` binary in a state directory of its own, and test hosts.
 
 #![expect(
     clippy::unwrap_used,
@@ -6,6 +6,8 @@
     clippy::panic,
     reason = "a test stops at the first surprise"
 )]
+
+pub mod rig;
 
 use serde_json::Value;
 use std::path::{Path, PathBuf};
