@@ -40,6 +40,21 @@ pub fn ictus() -> PathBuf {
     binary
 }
 
+/// The static binary that `.ci/static` builds, which runs on any host of this processor; static programs are beside it.
+#[must_use]
+pub fn static_ictus() -> PathBuf {
+    let target = ictus();
+    let target = target.ancestors().nth(2).unwrap();
+    let triple = format!("{}-unknown-linux-gnu", std::env::consts::ARCH);
+    let binary = target.join(triple).join("release/ictus");
+    assert!(
+        binary.exists(),
+        "{} is missing: `.ci/static` first, as make test does",
+        binary.display()
+    );
+    binary
+}
+
 /// A daemon, a state directory and nothing else; all of it goes with the value.
 #[derive(Debug)]
 pub struct Sandbox {

@@ -3,6 +3,7 @@
 //! All share one rig, one after the other, and each must leave the hosts as it found them: what the leak checker still sees
 //! after it is a failure. After a failure the hosts' logs are gathered and the next scenario gets a rig of its own.
 
+mod deployments;
 mod hosts;
 
 use ictus_tests::rig::{self, Rig, Snapshot};
@@ -17,7 +18,7 @@ const HOSTS: u8 = 3;
 type Scenario = (&'static str, fn(&Rig));
 
 /// Every scenario of these modules, in order.
-const SCENARIOS: &[&[Scenario]] = &[hosts::SCENARIOS];
+const SCENARIOS: &[&[Scenario]] = &[hosts::SCENARIOS, deployments::SCENARIOS];
 
 #[expect(clippy::print_stdout, reason = "a test's report")]
 fn main() -> ExitCode {

@@ -28,26 +28,12 @@ fn static_fakes() -> &'static Path {
         if Machine::of(fakes()).unwrap().interpreter.is_none() {
             return fakes().to_path_buf();
         }
-        let target = format!("{}-unknown-linux-gnu", std::env::consts::ARCH);
-        let directory = fakes().ancestors().nth(2).unwrap().join("static");
-        let cargo = std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into());
-        let status = Command::new(cargo)
-            .args([
-                "build",
-                "--quiet",
-                "--package",
-                "ictusd",
-                "--bin",
-                "ictusd-fakes",
-            ])
-            .args(["--target", &target, "--target-dir"])
-            .arg(&directory)
-            .env("RUSTFLAGS", "-C target-feature=+crt-static")
-            .env_remove("CARGO_ENCODED_RUSTFLAGS")
-            .current_dir(env!("CARGO_MANIFEST_DIR"))
-            .status();
-        assert!(status.unwrap().success());
-        directory.join(target).join("debug/ictusd-fakes")
+        // Together with `ictus`, as `make test` has done by then.
+        let root = Path::new(env!("CARGO_MANIFEST_DIR")).parent().unwrap();
+        let built = Command::new(root.join(".ci/static")).output().unwrap();
+        assert!(built.status.success(), "{built:?}");
+        let ictus = String::from_utf8(built.stdout).unwrap();
+        root.join(ictus.trim_end()).with_file_name("ictusd-fakes")
     })
 }
 
