@@ -33,6 +33,10 @@ const INSPECT_EVERY: Duration = Duration::from_millis(200);
 /// How long the engine may take to notice that memory was used up.
 const NOTICE_MAX: Duration = Duration::from_secs(1);
 
+mod limits;
+
+use limits::Limit;
+
 /// A member's container, made or not.
 #[derive(Clone, Debug)]
 pub(crate) struct Contained {
@@ -362,10 +366,15 @@ impl Handle {
         Ok(found.and_then(|found| found.pid) == Some(pid))
     }
 
-    /// Whether the container's memory was used up; waits a moment for the engine to notice.
-    pub(super) async fn out_of_memory(&self) -> bool {
+    /// Whether the container's memory was used up. While its first process is there the kernel tells; afterwards the
+    /// engine does, in a moment.
+    pub(super) async fn out_of_memory(&self, first: Option<u32>) -> bool {
         if !self.limited {
             return false;
+        }
+        let killed = first.and_then(|pid| limits::count(pid, Limit::Memory));
+        if let Some(killed) = killed {
+            return killed > 0;
         }
         let noticed = async {
             loop {
@@ -377,6 +386,11 @@ impl Handle {
             }
         };
         timeout(NOTICE_MAX, noticed).await.unwrap_or(false)
+    }
+
+    /// How often a process or thread was refused because there were too many.
+    pub(super) fn processes_refused(&self, first: u32) -> u64 {
+        limits::count(first, Limit::Processes).unwrap_or(0)
     }
 
     /// Removes the container, whatever runs in it.

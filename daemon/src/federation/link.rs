@@ -373,12 +373,18 @@ impl Link {
         if let Some((_, here)) = self.child.filter(|(inside, _)| record.pid == Some(*inside)) {
             record.pid = Some(here);
         }
+        let Some(handle) = &self.handle else {
+            return record;
+        };
+        let first = self.supervisor.map(|supervisor| supervisor.pid);
         let killed = record.ending == Ending::Killed { signal: SIGKILL };
-        if killed
-            && let Some(handle) = &self.handle
-            && handle.out_of_memory().await
-        {
+        if killed && handle.out_of_memory(first).await {
             record.ending = Ending::OutOfMemory;
+        }
+        let refused = first.map_or(0, |first| handle.processes_refused(first));
+        if refused > 0 {
+            let remark = format!("its limit of processes (`pids:`) was reached {refused} times");
+            record.first_lines.insert(0, remark);
         }
         record
     }
@@ -386,7 +392,7 @@ impl Link {
     /// The supervisor could not write a record: that its memory was used up is known all the same.
     async fn without_record(&self) -> Option<Box<ExitRecord>> {
         let handle = self.handle.as_ref()?;
-        handle.out_of_memory().await.then(|| {
+        handle.out_of_memory(None).await.then(|| {
             Box::new(ExitRecord {
                 protocol: PROTOCOL,
                 instance: self.instance.clone(),

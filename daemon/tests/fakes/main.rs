@@ -238,6 +238,17 @@ fn federate(options: &BTreeMap<String, String>) -> ExitCode {
             println!("orphan {}", child.id());
             ExitCode::SUCCESS
         }
+        "crowd" => loop {
+            let one_more = thread::Builder::new().spawn(|| {
+                loop {
+                    thread::park();
+                }
+            });
+            if let Err(error) = one_more {
+                eprintln!("{error}");
+                return ExitCode::from(3);
+            }
+        },
         "fill" => {
             let mut kept = Vec::new();
             loop {

@@ -355,6 +355,19 @@ async fn memory_that_is_used_up_is_named_as_the_cause() {
 }
 
 #[tokio::test]
+async fn too_many_processes_are_named_as_the_cause() {
+    let Some(rig) = Rig::new() else { return };
+    let mut request = rig.request(&[("a", "crowd"), ("b", "")]);
+    request.federates[0].needs.pids = Some(20);
+    let failure = rig.fails(&request).await;
+    assert_eq!(failure.member.as_deref(), Some("a"));
+    assert!(
+        failure.lines[0].contains("its limit of processes (`pids:`) was reached"),
+        "{failure:?}"
+    );
+}
+
+#[tokio::test]
 async fn an_image_that_is_not_there_is_named() {
     let Some(rig) = Rig::new() else { return };
     let mut request = rig.request(&[("a", ""), ("b", "")]);
