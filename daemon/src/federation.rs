@@ -27,7 +27,7 @@ pub(crate) mod launch;
 mod link;
 mod order;
 
-use container::Contained;
+use container::{Contained, Images};
 use launch::Run;
 use link::{Heard, Link, Origin};
 use order::Order;
@@ -296,7 +296,8 @@ impl Federation {
     /// Removes what a start that failed has made.
     async fn undo(&self) {
         if self.in_containers() {
-            let swept = container::sweep(&self.record.view.name, Some(&self.record)).await;
+            let swept =
+                container::sweep(&self.record.view.name, Some(&self.record), Images::Remove).await;
             if let Err(error) = swept {
                 tracing::warn!(%error, "perhaps containers or images were left");
             }

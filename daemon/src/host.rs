@@ -13,6 +13,7 @@ use crate::api::{
     ApiError, ErrorCode, Failure, FailureKind, FederateMeasures, FederationMeasures,
     FederationView, Happening, MemberView, Outcome, Removed, StartRequest, State,
 };
+use crate::federation::container::Images;
 use crate::federation::{BeginError, Command, Federation, Handle};
 use crate::leases::Leases;
 use crate::metrics::{self, Snapshot};
@@ -241,7 +242,7 @@ impl Host {
         }
         self.check_driven(name)?;
         self.listeners().release(name);
-        self.remove_containers(name).await?;
+        self.remove_containers(name, Images::Remove).await?;
         let kept = self
             .directory(name)
             .remove(purge)

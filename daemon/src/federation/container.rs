@@ -54,6 +54,15 @@ pub(crate) struct Contained {
     socket_directory: PathBuf,
 }
 
+/// What becomes of a federation's images when its containers are removed.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Images {
+    /// The next run needs them.
+    Keep,
+    /// Those that nothing uses go, too.
+    Remove,
+}
+
 /// Where a container's image comes from.
 #[derive(Clone, Debug)]
 enum Source {
@@ -431,8 +440,12 @@ pub(crate) async fn prepare(run: &Run<'_>, members: &[MemberId]) -> Result<(), C
     Ok(())
 }
 
-/// Removes containers of a run that are provably ours, and the images that nothing uses any more.
-pub(crate) async fn sweep(federation: &str, record: Option<&Record>) -> Result<(), EngineError> {
+/// Removes containers of a run that are provably ours, and the images that nothing uses any more if they are to go.
+pub(crate) async fn sweep(
+    federation: &str,
+    record: Option<&Record>,
+    images: Images,
+) -> Result<(), EngineError> {
     let engine = Engine::connect().await?;
     let members = record
         .into_iter()
@@ -457,9 +470,11 @@ pub(crate) async fn sweep(federation: &str, record: Option<&Record>) -> Result<(
             "foreign: it has our label, but is in no record of ours; left alone"
         );
     }
-    engine
-        .remove_images((label::FEDERATION, federation))
-        .await?;
+    if images == Images::Remove {
+        engine
+            .remove_images((label::FEDERATION, federation))
+            .await?;
+    }
     Ok(())
 }
 

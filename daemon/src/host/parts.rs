@@ -12,6 +12,7 @@ use crate::api::part::{
 };
 use crate::api::{ApiError, ErrorCode, State};
 use crate::blobs::{BlobError, Blobs};
+use crate::federation::container::Images;
 use crate::federation::launch::Run;
 use crate::federation::{Federation, Handle, container};
 use crate::files;
@@ -186,8 +187,15 @@ impl Host {
         })
     }
 
-    /// Removes the containers and images that a run left.
-    pub(super) async fn remove_containers(&self, name: &str) -> Result<(), ApiError> {
+    /// Removes the containers that a run left, and its images unless they are kept. One that lives keeps its own.
+    pub(crate) async fn remove_containers(
+        &self,
+        name: &str,
+        images: Images,
+    ) -> Result<(), ApiError> {
+        if self.handle(name).is_some() {
+            return Ok(());
+        }
         let directory = self.directory(name);
         let part = directory
             .read_request()
@@ -197,7 +205,7 @@ impl Host {
             return Ok(());
         }
         let record = recorded(name, &directory).map_err(|error| store_error(&error))?;
-        container::sweep(name, record.as_ref())
+        container::sweep(name, record.as_ref(), images)
             .await
             .map_err(|error| error_of(format!("federation `{name}` leaves containers: {error}")))
     }

@@ -18,6 +18,7 @@ use crate::api::part::{
 use crate::api::{ApiError, ErrorCode};
 use crate::docker::Engine;
 use crate::facts;
+use crate::federation::container::Images;
 use crate::host::Host;
 
 use super::{JsonLines, StarterGuard, bad_request, pass_until_end, stream};
@@ -170,6 +171,9 @@ pub(super) async fn prepare(
     body: Bytes,
 ) -> Result<Json<Prepared>, ApiError> {
     let request: PrepareRequest = parse(&body)?;
+    host.check_fence(&name, Some(query.fence))?;
+    // What the engine could not remove when the last run ended is in its record, which makes way.
+    host.remove_containers(&name, Images::Keep).await?;
     let prepared = host.prepare(&name, query.fence, &request)?;
     // Afterwards, because only then everything that it needs is known to be there.
     host.prepare_images(&name).await?;
