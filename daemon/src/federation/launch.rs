@@ -1,6 +1,6 @@
 //! The command lines of the RTI, of our federates and of foreign ones.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::net::{Ipv4Addr, SocketAddrV4};
 use std::path::{Path, PathBuf};
 
@@ -9,6 +9,7 @@ use ictus_deploy::{FederateKind, FederateRun};
 
 use crate::agent::{MemberId, RTI};
 use crate::api::StartRequest;
+use crate::api::part::Part;
 use crate::paths::Paths;
 use crate::store::{Directory, Record, Supervised};
 use crate::supervisor::log_path;
@@ -115,6 +116,7 @@ impl Run<'_> {
         let mut args = rti_args(request, &self.record.view.id, self.record.view.rti_port);
         if let Some(part) = &request.part {
             args.extend(["--bind".to_owned(), part.address.to_string()]);
+            args.extend(["--allow".to_owned(), allowed(part)]);
         }
         args
     }
@@ -135,6 +137,7 @@ impl Run<'_> {
                 let mut args: Vec<_> = args.into_iter().map(str::to_owned).collect();
                 if let Some(part) = &self.request.part {
                     args.extend(["--data-address".to_owned(), part.address.to_string()]);
+                    args.extend(["--allow".to_owned(), allowed(part)]);
                 }
                 if self.request.trace {
                     args.extend(["--trace".to_owned(), path(&directory.trace())]);
@@ -143,6 +146,14 @@ impl Run<'_> {
             }
         }
     }
+}
+
+/// The addresses of the federation's hosts: nobody else has anything to say to its members. The loopback address is
+/// this host's own, when all share it.
+fn allowed(part: &Part) -> String {
+    let addresses: BTreeSet<Ipv4Addr> = part.hosts.values().map(|host| host.address).collect();
+    let addresses: Vec<_> = addresses.iter().map(ToString::to_string).collect();
+    addresses.join(",")
 }
 
 fn rti_args(request: &StartRequest, federation_id: &str, prepared: Option<u16>) -> Vec<String> {

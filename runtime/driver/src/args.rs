@@ -27,6 +27,8 @@ pub(crate) struct RunArgs {
     pub(crate) status_fd: Option<u32>,
     /// Where other federates reach this one, when it is not the address by which it reaches the RTI.
     pub(crate) data_address: Option<Ipv4Addr>,
+    /// From where other federates connect; empty: from everywhere.
+    pub(crate) allow: Vec<Ipv4Addr>,
 }
 
 /// Why a command line is refused.
@@ -40,13 +42,15 @@ pub(crate) enum ArgsError {
     BadDescriptor(String),
     #[error("--data-address needs an IPv4 address of this host, not {0:?}")]
     BadAddress(String),
+    #[error("--allow needs IPv4 addresses with commas between them, not {0:?}")]
+    BadPeer(String),
     #[error("nothing to do: give --plan FILE, or --describe")]
     Nothing,
 }
 
 pub(crate) const USAGE: &str = "\
 usage: PROGRAM --plan PLAN.json [--federate NAME]... [--rti HOST:PORT] [-i ID]
-               [--data-address IPv4] [--trace DIR] [--timing DIR] [--status-fd N]
+               [--data-address IPv4] [--allow IPv4[,IPv4]...] [--trace DIR] [--timing DIR] [--status-fd N]
        PROGRAM --describe [INSTANCES.json]
 
 Without --rti the whole plan runs in this process. With --rti each named federate joins the RTI as itself.
@@ -82,6 +86,13 @@ pub(crate) fn parse(args: impl IntoIterator<Item = String>) -> Result<Command, A
                 let text = value()?;
                 let address = text.parse().map_err(|_| ArgsError::BadAddress(text))?;
                 run.data_address = Some(address);
+            }
+            "--allow" => {
+                for text in value()?.split(',') {
+                    let address = text.trim().parse();
+                    let address = address.map_err(|_| ArgsError::BadPeer(text.to_owned()))?;
+                    run.allow.push(address);
+                }
             }
             _ => return Err(ArgsError::Unknown(arg)),
         }
@@ -125,6 +136,10 @@ mod tests {
         let line =
             "--plan p.json --federate a --federate b --rti 127.0.0.1:15045 -i x --status-fd 3";
         assert_eq!(words(line), Ok(Command::Run(run)));
+        assert_eq!(
+            words("--plan p --allow 10.0.0.1,10.0.0."),
+            Err(ArgsError::BadPeer("10.0.0.".into()))
+        );
         assert_eq!(
             words("--plan p --data-address robot.local"),
             Err(ArgsError::BadAddress("robot.local".into()))

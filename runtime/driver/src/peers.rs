@@ -24,6 +24,8 @@ pub(crate) struct Peers {
     connections: Vec<Peer>,
     /// Receivers that could not be reached at first.
     unreachable: BTreeSet<u16>,
+    /// From where others connect; empty: from everywhere.
+    allow: Vec<Ipv4Addr>,
 }
 
 #[derive(Debug)]
@@ -53,6 +55,14 @@ impl Peer {
 }
 
 impl Peers {
+    /// None yet, and strangers from other addresses never; empty: from everywhere.
+    pub(crate) fn allowing(allow: Vec<Ipv4Addr>) -> Self {
+        Self {
+            allow,
+            ..Self::default()
+        }
+    }
+
     /// Listens at `address`, when others will connect, and tells the federate where.
     pub(crate) fn listen(&mut self, address: IpAddr, federate: &mut Federate) -> io::Result<()> {
         if federate.expects_peers() {
@@ -131,6 +141,11 @@ impl Peers {
             return;
         };
         while let Ok((stream, address)) = listener.accept() {
+            let known = |ip: IpAddr| self.allow.iter().any(|it| ip == IpAddr::V4(*it));
+            if !self.allow.is_empty() && !known(address.ip()) {
+                // Not a host of the federation: it is told nothing.
+                continue;
+            }
             let Ok(connection) = Connection::of(stream, address) else {
                 continue;
             };
@@ -309,6 +324,20 @@ mod tests {
         peers.read(NOW, federate, &mut Nothing);
         peers.write(NOW, federate);
         peers.tidy(federate);
+    }
+
+    #[test]
+    fn only_hosts_of_the_federation_connect() {
+        for (allowed, taken) in [([10, 9, 8, 7], 0), ([127, 0, 0, 1], 1)] {
+            let mut federate = federate(true);
+            let mut peers = Peers::allowing(vec![Ipv4Addr::from(allowed)]);
+            peers.listen(here(), &mut federate).unwrap();
+            let address = peers.listener.as_ref().unwrap().local_addr().unwrap();
+            let stranger = TcpStream::connect(address).unwrap();
+            look(&mut peers, &mut federate);
+            assert_eq!(peers.connections.len(), taken, "{allowed:?}");
+            drop(stranger);
+        }
     }
 
     #[test]

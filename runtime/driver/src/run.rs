@@ -241,7 +241,7 @@ fn run_one(job: &Job<'_>, ids: &[u16], rti: Option<SocketAddr>) -> Result<u8, Ru
     let runner = Runner {
         io: Io {
             connection,
-            peers: Peers::default(),
+            peers: Peers::allowing(job.args.allow.clone()),
             waker: Waker::new().map_err(RunError::Io)?,
             signals: Signals::new().map_err(RunError::Io)?,
         },

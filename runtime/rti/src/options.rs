@@ -37,6 +37,7 @@ Coordinates one federation; takes the options of Lingua Franca's RTI.
   -c, --clock_sync off|init|initial|on [period NS] [exchanges-per-interval K]
                                 compare clocks while federates join, `on`: and every period from then on
                                 (default off; 10 ms; 10 exchanges)
+      --allow IPv4[,IPv4]...    take connections only from these addresses (default: from all)
       --clock-port PORT         UDP port for that (default 0: any free one; LF's RTI: 15061)
       --clock-stamps kernel|reader
                                 who says when a datagram came (default kernel)
@@ -70,6 +71,8 @@ pub struct Options {
     pub config: RtiConfig,
     /// The address to listen on.
     pub bind: IpAddr,
+    /// From where connections are taken; empty: from everywhere.
+    pub allow: Vec<Ipv4Addr>,
     /// Whether nobody chose that address.
     pub bind_is_default: bool,
     /// The TCP port to listen on; 0: the system chooses one.
@@ -126,6 +129,7 @@ impl Options {
         Self {
             config: RtiConfig::new(federation, federates),
             bind: IpAddr::V4(Ipv4Addr::LOCALHOST),
+            allow: Vec::new(),
             bind_is_default: true,
             port: 0,
             clock_port: 0,
@@ -198,6 +202,7 @@ impl Parser {
             "-c" | "--clock_sync" => self.clock_sync(option)?,
             "-a" | "--auth" => self.options.config.authentication = true,
             "--continue" => self.continue_without(option)?,
+            "--allow" => self.allow(option)?,
             "--clock-port" => {
                 self.options.clock_port = self.number(option, "a port (0 to 65535)")?;
             }
@@ -293,6 +298,17 @@ impl Parser {
             number @ (0 | u16::MAX) => invalid(option, expected, number.to_string()),
             number => Ok(number),
         }
+    }
+
+    fn allow(&mut self, option: &str) -> Result<(), UsageError> {
+        let value = self.value(option)?;
+        for address in value.split(',') {
+            let Ok(address) = address.trim().parse() else {
+                return invalid(option, "IPv4 addresses with commas between them", value);
+            };
+            self.options.allow.push(address);
+        }
+        Ok(())
     }
 
     fn continue_without(&mut self, option: &str) -> Result<(), UsageError> {
@@ -517,6 +533,10 @@ mod tests {
             (
                 "-n 3 --continue 1,3",
                 "`--continue` takes ids of federates, below `-n`, with commas between them, not `3`",
+            ),
+            (
+                "-n 3 --allow 10.0.0.1,pi",
+                "`--allow` takes IPv4 addresses with commas between them, not `10.0.0.1,pi`",
             ),
             (
                 "-n 3 --continue 1,",

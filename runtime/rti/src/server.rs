@@ -1,7 +1,7 @@
 //! The loop: wait, read everything that is ready, decide once, write, say what happened.
 
 use std::io::{self, Read};
-use std::net::SocketAddr;
+use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::time::Duration;
 
 use ictus_clock::HostClock;
@@ -24,6 +24,8 @@ const SIGNALS: Token = Token(usize::MAX - 1);
 const PROBES: Token = Token(usize::MAX - 2);
 /// Connections that have not said who they are, beyond those of the federates.
 const STRANGERS: usize = 256;
+/// Told of a connection from elsewhere; it itself is told nothing.
+const NOT_ALLOWED: &str = "it comes from no host of the federation";
 /// The most connections accepted in one round: all are read, four times at least, before the oldest must make room.
 const ACCEPT: usize = STRANGERS / 4;
 /// How many newcomers the system keeps for us, as far as it allows: a whole large federation comes at once.
@@ -46,6 +48,8 @@ pub struct Server {
     clock: HostClock,
     probing: Option<Probing>,
     status: Status,
+    /// From where connections are taken; empty: from everywhere.
+    allow: Vec<Ipv4Addr>,
     buffer: Vec<u8>,
     port: u16,
     /// Nobody chose the address: only this host's federates can join.
@@ -139,6 +143,7 @@ impl Server {
             status,
             buffer: vec![0; 2 * READ],
             port,
+            allow: options.allow.clone(),
             bind_is_default: options.bind_is_default,
         })
     }
@@ -286,6 +291,10 @@ impl Server {
                 return;
             }
             match listener.accept() {
+                Ok((_, peer)) if !self.is_allowed(peer) => {
+                    let (peer, reason) = (peer.to_string(), NOT_ALLOWED.to_owned());
+                    self.status.tell(RtiEvent::Rejected { peer, reason });
+                }
                 Ok((stream, peer)) => {
                     if let Some(id) = evicted {
                         self.remove(id, now, &Disconnect::Evicted);
@@ -303,6 +312,14 @@ impl Server {
                 }
             }
         }
+    }
+
+    fn is_allowed(&self, peer: SocketAddr) -> bool {
+        let address = match peer.ip() {
+            IpAddr::V4(address) => Some(address),
+            IpAddr::V6(address) => address.to_ipv4_mapped(),
+        };
+        self.allow.is_empty() || address.is_some_and(|address| self.allow.contains(&address))
     }
 
     /// Where no descriptor is left one stranger a round makes room: the others of the round are read first.

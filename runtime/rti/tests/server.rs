@@ -33,6 +33,23 @@ fn serve(options: Options) -> Running {
     }
 }
 
+#[test]
+fn only_hosts_of_the_federation_are_let_in() {
+    let mut options = Options::new("test", 1);
+    options.allow = vec![Ipv4Addr::new(10, 9, 8, 7)];
+    let refusing = serve(options.clone());
+    let mut refused = refusing.connect();
+    assert_eq!(
+        refused.stream.read(&mut [0]).unwrap_or(0),
+        0,
+        "it is told nothing"
+    );
+    options.allow.push(Ipv4Addr::LOCALHOST);
+    let admitting = serve(options);
+    let mut peer = admitting.join(0, &[], &[]);
+    peer.start();
+}
+
 impl Running {
     fn ended(self) -> u8 {
         self.thread.join().unwrap()
