@@ -2,8 +2,8 @@
 # What runs inside a test host. `host up CGROUP` is the child of its first process; the rest is called with `docker exec`.
 set -eu
 
-# Seconds until a part that does not start or stop is an error.
-bound=30
+# Seconds until a part that does not start or stop is an error: some times what a machine full of compilers needs.
+bound=90
 
 # until_true MESSAGE COMMAND...
 until_true() {
@@ -20,6 +20,7 @@ until_true() {
     done
 }
 engine_listens() { [ -S /run/docker.sock ] && docker version; }
+containerd_listens() { [ -S /run/containerd/containerd.sock ] && ctr version; }
 engine_is_gone() { [ ! -e "/proc/$engine/stat" ]; }
 ssh_listens() { [ -n "$(ss -Hltn 'sport = :22')" ]; }
 
@@ -28,7 +29,12 @@ start_docker() {
     set -- --log-level warn --storage-driver overlay2
     if [ -s /var/lib/rig-cgroup ]; then set -- "$@" --cgroup-parent "$(cat /var/lib/rig-cgroup)"; fi
     rm -f /run/docker.pid
-    # Forked away: its parent is to be the reaper, not this script.
+    # Forked away: their parent is to be the reaper, not this script. As on a real host, containerd is a service of its
+    # own; dockerd would wait only 15 s for one that it starts itself.
+    if ! containerd_listens >/dev/null 2>&1; then
+        setsid --fork containerd --log-level warn >>/var/log/containerd.log 2>&1 </dev/null
+        until_true 'containerd does not answer' containerd_listens
+    fi
     setsid --fork dockerd "$@" >>/var/log/dockerd.log 2>&1 </dev/null
 }
 
@@ -48,13 +54,15 @@ up() {
         while read -r pid; do echo "$pid" >/sys/fs/cgroup/init/cgroup.procs 2>/dev/null || true; done </sys/fs/cgroup/cgroup.procs
         sed 's/[^ ]*/+&/g' /sys/fs/cgroup/cgroup.controllers >/sys/fs/cgroup/cgroup.subtree_control
     fi
-    start_docker
     # Cuts are made where packets come in: a packet dropped on its way out is an error that its sender sees.
     iptables --wait -t raw -N RIG
     iptables --wait -t raw -I PREROUTING -j RIG
-    ssh-keygen -q -A
+    for type in ed25519 ecdsa; do ssh-keygen -q -N '' -t "$type" -f "/etc/ssh/ssh_host_${type}_key"; done
+    # Smaller than the default, which takes a busy machine half a minute.
+    ssh-keygen -q -N '' -t rsa -b 2048 -f /etc/ssh/ssh_host_rsa_key
     mkdir -p /run/sshd
     /usr/sbin/sshd -E /var/log/sshd.log
+    start_docker
     exec sleep infinity
 }
 

@@ -15,8 +15,8 @@ echo '## sockets'
 
 echo '## mounts'
 # What the engine makes with the first container and keeps for itself is left out.
-awk '{ for (i = 7; $i != "-"; i++); print $5, $(i + 1), $(i + 2) }' |
-    grep -v '^/run/docker/netns/default ' || true /proc/self/mountinfo
+awk '{ for (i = 7; $i != "-"; i++); print $5, $(i + 1), $(i + 2) }' /proc/self/mountinfo |
+    grep -v '^/run/docker/netns/default ' || true
 
 echo '## cgroups'
 own=$(sed -n 's/^[0-9]*:[a-z]*memory[a-z,]*://p' /proc/1/cgroup)
