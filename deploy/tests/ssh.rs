@@ -457,8 +457,7 @@ async fn patterns_and_authorities_use_the_system_client_and_say_so() {
     let status = Command::new("ssh-keygen")
         .args(["-q", "-s"])
         .arg(sshd.path("authority"))
-        .args(["-I", "test", "-h", "-n", "127.0.0.1"]);
-    let status = status
+        .args(["-I", "test", "-h", "-n", "127.0.0.1"])
         .arg(sshd.path("host_ed25519.pub"))
         .stderr(Stdio::null())
         .status()
