@@ -125,7 +125,11 @@ impl Link {
         if let Some(contained) = &self.contained {
             let launched = contained.launch(spec, &self.spec).await;
             self.handle = Some(launched.map_err(|error| not_supervised(&error))?);
-            return self.connect(None).await;
+            // Made a moment ago, it is ours and is removed, whatever answers in it.
+            return self.connect(None).await.map_err(|failed| match failed {
+                Failed::Foreign(why) => Failed::NotSupervised(why),
+                other @ (Failed::NotSupervised(_) | Failed::Nobody) => other,
+            });
         }
         let failed = |what: &str, error: &dyn std::fmt::Display| {
             Failed::NotSupervised(format!("{what}: {error}"))
