@@ -43,8 +43,8 @@ pub enum Outcome {
     },
     /// Somebody else holds the lease, or has held it since.
     Held {
-        /// Who.
-        who: String,
+        /// Who, or that the number is not the last one, in the host's words.
+        what: String,
     },
 }
 
@@ -81,8 +81,8 @@ pub enum Phase {
     TakenOver {
         /// The host that said so.
         host: String,
-        /// Who holds the lease now.
-        who: String,
+        /// Who, or that the number is not the last one, in the host's words.
+        what: String,
     },
 }
 
@@ -238,20 +238,19 @@ impl Apply {
                 let at_ns = at_ns.unwrap_or(now.wall_ns);
                 self.fail(now, &host, &operation, (rank, at_ns, what));
             }
-            Outcome::Held { who } if operation == Operation::Lease => {
+            Outcome::Held { what } if operation == Operation::Lease => {
                 task.state = State::Failed;
-                let what = format!("{who} holds the lease");
                 self.fail(now, &host, &operation, (0, now.wall_ns, what));
             }
-            Outcome::Held { who } => self.handle_fenced(host, who),
+            Outcome::Held { what } => self.handle_fenced(host, what),
         }
         self.conclude();
     }
 
     /// A host said, for instance when the lease was renewed, that somebody else has taken it since.
-    pub fn handle_fenced(&mut self, host: String, who: String) {
+    pub fn handle_fenced(&mut self, host: String, what: String) {
         if !self.phase.is_over() {
-            self.phase = Phase::TakenOver { host, who };
+            self.phase = Phase::TakenOver { host, what };
         }
     }
 

@@ -89,10 +89,10 @@ impl Plan {
                 step.cause.clone(),
             ),
             // Why is said at the head.
-            Operation::StopOld { run } => ("- stop", format!("run {}", short(run)), String::new()),
+            Operation::StopOld { run } => ("- stop", run_words(run), String::new()),
             Operation::RemoveOld { run: Some(run), .. } => (
                 "- remove",
-                format!("run {}", short(run)),
+                run_words(run),
                 step.cause.clone(),
             ),
             Operation::RemoveOld { run: None, .. } => {
@@ -107,6 +107,14 @@ impl Plan {
             | Operation::StopPart { .. }
             | Operation::Release => return None,
         })
+    }
+}
+
+/// A run as people see it; a damaged record has no id.
+fn run_words(run: &str) -> String {
+    match run.is_empty() {
+        true => "a damaged record".to_owned(),
+        false => format!("run {}", short(run)),
     }
 }
 

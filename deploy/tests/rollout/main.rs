@@ -1,0 +1,10 @@
+//! Plan and apply over several hosts: what is planned and refused, what failures mean, and both in a world of simulated
+//! hosts that lose messages, restart and are changed by others.
+
+#![expect(clippy::unwrap_used, reason = "a test stops at the first surprise")]
+
+mod applying;
+mod desired;
+mod outcomes;
+mod planning;
+mod simulation;
