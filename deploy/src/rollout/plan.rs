@@ -15,6 +15,9 @@ use crate::placement::Engine;
 /// The format of a plan in a file.
 const FORMAT: u32 = 1;
 
+/// The RTI among a part's members.
+const RTI: &str = "rti";
+
 /// How long a call may take that only writes a record.
 const CALL_LIMIT_MS: u64 = 20_000;
 
@@ -553,16 +556,25 @@ impl<'a> Graph<'a> {
         let cause = "it is taken down";
         let leased = self.lease();
         let stopped = self.stop(cause, &leased);
-        let mut removed = Vec::new();
         let runs: BTreeMap<String, Run> = self.runs().into_iter().collect();
-        for host in self.observed.keys() {
-            let run = runs.get(host).map(|run| run.id.clone());
-            if run.is_some() || purge {
-                let operation = Operation::RemoveOld { run, purge };
-                removed.push(self.add(host, operation, cause, &stopped));
+        // The RTI's host last: while parts are left somewhere, it tells whoever goes on with this where.
+        let has_rti = |host: &&String| {
+            runs.get(*host)
+                .is_some_and(|run| run.members.contains_key(RTI))
+        };
+        let (last, first): (Vec<&String>, Vec<&String>) = self.observed.keys().partition(has_rti);
+        let mut removed = stopped;
+        for hosts in [first, last] {
+            let mut layer = Vec::new();
+            for host in hosts {
+                let run = runs.get(host).map(|run| run.id.clone());
+                if run.is_some() || purge {
+                    let operation = Operation::RemoveOld { run, purge };
+                    layer.push(self.add(host, operation, cause, &removed));
+                }
             }
+            removed = joined(layer, &removed);
         }
-        let removed = joined(removed, &stopped);
         self.release(&removed);
         self.steps
     }

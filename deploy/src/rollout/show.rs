@@ -90,11 +90,9 @@ impl Plan {
             ),
             // Why is said at the head.
             Operation::StopOld { run } => ("- stop", run_words(run), String::new()),
-            Operation::RemoveOld { run: Some(run), .. } => (
-                "- remove",
-                run_words(run),
-                step.cause.clone(),
-            ),
+            Operation::RemoveOld { run: Some(run), .. } => {
+                ("- remove", run_words(run), step.cause.clone())
+            }
             Operation::RemoveOld { run: None, .. } => {
                 ("- remove", "what is left".to_owned(), step.cause.clone())
             }

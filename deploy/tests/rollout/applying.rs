@@ -55,7 +55,11 @@ fn failed(what: &str, rank: u8, at_ns: i64) -> Outcome {
 fn until(apply: &mut Apply, name: &str) -> Vec<Step> {
     loop {
         let begun = steps(apply, at(0));
-        assert!(!begun.is_empty(), "{name} never begins: {:?}", apply.phase());
+        assert!(
+            !begun.is_empty(),
+            "{name} never begins: {:?}",
+            apply.phase()
+        );
         if begun.iter().any(|step| step.operation.name() == name) {
             return begun;
         }
@@ -82,9 +86,14 @@ fn everything_in_order_ends_healthy() {
     assert_eq!(
         order,
         [
-            "bench lease", "nuc lease", "bench stop_old, nuc stop_old",
-            "bench prepare, nuc prepare", "bench commit_rti", "nuc commit",
-            "bench await_healthy, nuc await_healthy", "bench release, nuc release",
+            "bench lease",
+            "nuc lease",
+            "bench stop_old, nuc stop_old",
+            "bench prepare, nuc prepare",
+            "bench commit_rti",
+            "nuc commit",
+            "bench await_healthy, nuc await_healthy",
+            "bench release, nuc release",
         ]
     );
     assert_eq!(*apply.phase(), Phase::Done);
@@ -95,7 +104,11 @@ fn what_fails_before_the_commit_is_undone_wherever_it_was_asked() {
     let mut apply = apply();
     let prepares = until(&mut apply, "prepare");
     assert_eq!(*apply.phase(), Phase::Preparing);
-    apply.handle_done(at(1), prepares[0].id, failed("no space left on device", 0, 5));
+    apply.handle_done(
+        at(1),
+        prepares[0].id,
+        failed("no space left on device", 0, 5),
+    );
     assert_eq!(*apply.phase(), Phase::Undoing);
     // `nuc` has not answered: what undoes it must not overtake it.
     let undoes = steps(&mut apply, at(1));
@@ -104,7 +117,10 @@ fn what_fails_before_the_commit_is_undone_wherever_it_was_asked() {
     done(&mut apply, &undoes[0]);
     // It is never answered.
     let limit = apply.poll_timeout().unwrap();
-    apply.handle_timeout(Moment { elapsed: limit, wall_ns: 9 });
+    apply.handle_timeout(Moment {
+        elapsed: limit,
+        wall_ns: 9,
+    });
     let undoes = steps(&mut apply, at(1));
     assert_eq!(words(&undoes), ["nuc remove_part"]);
     done(&mut apply, &undoes[0]);
@@ -116,7 +132,10 @@ fn what_fails_before_the_commit_is_undone_wherever_it_was_asked() {
     let Phase::Undone { cause, old_stopped } = apply.phase().clone() else {
         panic!("{:?}", apply.phase());
     };
-    assert_eq!(cause.unwrap().to_string(), "host `bench`, preparing: no space left on device");
+    assert_eq!(
+        cause.unwrap().to_string(),
+        "host `bench`, preparing: no space left on device"
+    );
     assert!(old_stopped);
 }
 
@@ -146,13 +165,21 @@ fn what_fails_after_the_commit_stops_all_parts_and_the_first_cause_is_told() {
     let waits = until(&mut apply, "await_healthy");
     assert_eq!(*apply.phase(), Phase::Committing);
     // `bench` notices first that `nuc` is gone; `nuc` says why.
-    apply.handle_done(at(1), waits[0].id, failed("federate `lidar` was lost", 3, 10));
+    apply.handle_done(
+        at(1),
+        waits[0].id,
+        failed("federate `lidar` was lost", 3, 10),
+    );
     let stops = steps(&mut apply, at(1));
     assert_eq!(words(&stops), ["bench stop_part", "nuc stop_part"]);
     for step in &stops {
         done(&mut apply, step);
     }
-    apply.handle_done(at(2), waits[1].id, failed("federate `lidar` panicked", 0, 12));
+    apply.handle_done(
+        at(2),
+        waits[1].id,
+        failed("federate `lidar` panicked", 0, 12),
+    );
     for step in steps(&mut apply, at(2)) {
         done(&mut apply, &step);
     }
@@ -196,7 +223,13 @@ fn of_two_who_want_the_leases_one_gets_all() {
     assert_eq!(words(&releases), ["bench release"]);
     done(&mut apply, &releases[0]);
     assert!(steps(&mut apply, at(0)).is_empty());
-    assert!(matches!(apply.phase(), Phase::Undone { old_stopped: false, .. }));
+    assert!(matches!(
+        apply.phase(),
+        Phase::Undone {
+            old_stopped: false,
+            ..
+        }
+    ));
 }
 
 #[test]
@@ -206,7 +239,10 @@ fn who_is_fenced_off_does_nothing_more() {
     done(&mut refused, &prepares[0]);
     let what = "the number is not the last one".to_owned();
     refused.handle_done(at(0), prepares[1].id, Outcome::Held { what: what.clone() });
-    let taken = Phase::TakenOver { host: "nuc".to_owned(), what: what.clone() };
+    let taken = Phase::TakenOver {
+        host: "nuc".to_owned(),
+        what: what.clone(),
+    };
     assert_eq!(*refused.phase(), taken);
     assert!(steps(&mut refused, at(0)).is_empty());
     assert_eq!(refused.poll_timeout(), None);
@@ -255,5 +291,8 @@ fn late_and_foreign_answers_are_not_heard() {
     let mut waiting = lease[0].id;
     waiting.0 = 3;
     apply.handle_done(at(0), waiting, Outcome::Done);
-    assert_eq!((apply.phase(), steps(&mut apply.clone(), at(0)).len()), (&before, 0));
+    assert_eq!(
+        (apply.phase(), steps(&mut apply.clone(), at(0)).len()),
+        (&before, 0)
+    );
 }

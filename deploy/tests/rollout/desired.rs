@@ -93,8 +93,14 @@ fn touched(change: impl FnOnce(&mut Checked)) -> Vec<String> {
 fn each_host_has_its_part_and_programs() {
     let desired = desired(&checked());
     let nuc = &desired.hosts["nuc"];
-    assert_eq!((nuc.rti, nuc.federates.as_slice()), (true, ["a".to_owned()].as_slice()));
-    assert_eq!((nuc.blobs[0].bytes, nuc.blobs[0].digest.as_str()), (9, "5ee"));
+    assert_eq!(
+        (nuc.rti, nuc.federates.as_slice()),
+        (true, ["a".to_owned()].as_slice())
+    );
+    assert_eq!(
+        (nuc.blobs[0].bytes, nuc.blobs[0].digest.as_str()),
+        (9, "5ee")
+    );
     assert!(!desired.hosts["pi"].rti);
     assert_eq!((desired.federates(), desired.digest.len()), (2, 64));
     let mut here = checked();
@@ -102,7 +108,10 @@ fn each_host_has_its_part_and_programs() {
     assert!(self::desired(&here).hosts["nuc"].blobs.is_empty());
     let mut one = checked();
     one.placement.as_mut().unwrap().federates = vec![0, 0];
-    assert_eq!(self::desired(&one).hosts["nuc"].blobs[0].federates, ["a", "b"]);
+    assert_eq!(
+        self::desired(&one).hosts["nuc"].blobs[0].federates,
+        ["a", "b"]
+    );
 }
 
 #[test]
@@ -112,10 +121,22 @@ fn paths_of_this_machine_and_secrets_do_not_count() {
             it.federates[0].needs.secrets = BTreeMap::from([("TOKEN".to_owned(), source)]);
         }
     };
-    assert_eq!(touched(|it| it.manifest = "/elsewhere.yaml".into()), Vec::<String>::new());
-    assert_eq!(touched(|it| it.federates[0].executable = "/elsewhere".into()), Vec::<String>::new());
-    assert_eq!(touched(|it| it.placement.as_mut().unwrap().hosts[0].way = Way::Local), Vec::<String>::new());
-    assert_eq!(touched(secret(SecretSource::Environment)), ["federate/a/environment"]);
+    assert_eq!(
+        touched(|it| it.manifest = "/elsewhere.yaml".into()),
+        Vec::<String>::new()
+    );
+    assert_eq!(
+        touched(|it| it.federates[0].executable = "/elsewhere".into()),
+        Vec::<String>::new()
+    );
+    assert_eq!(
+        touched(|it| it.placement.as_mut().unwrap().hosts[0].way = Way::Local),
+        Vec::<String>::new()
+    );
+    assert_eq!(
+        touched(secret(SecretSource::Environment)),
+        ["federate/a/environment"]
+    );
     let (mut one, mut other) = (checked(), checked());
     secret(SecretSource::Environment)(&mut one);
     secret(SecretSource::File("/home/ann/token".into()))(&mut other);
@@ -125,15 +146,37 @@ fn paths_of_this_machine_and_secrets_do_not_count() {
 #[test]
 fn what_matters_counts_where_it_belongs() {
     let parameter = |it: &mut Checked| {
-        it.plan.federates[1].parameters.insert("gain".to_owned(), 2.into());
+        it.plan.federates[1]
+            .parameters
+            .insert("gain".to_owned(), 2.into());
     };
     assert_eq!(touched(parameter), ["federate/b/parameters"]);
-    assert_eq!(touched(|it| it.placement.as_mut().unwrap().federates[1] = 0), ["federate/b/host"]);
-    assert_eq!(touched(|it| it.placement.as_mut().unwrap().rti = 1), ["rti/host"]);
-    assert_eq!(touched(|it| it.placement.as_mut().unwrap().hosts[1].engine = Engine::Docker), ["host/pi"]);
+    assert_eq!(
+        touched(|it| it.placement.as_mut().unwrap().federates[1] = 0),
+        ["federate/b/host"]
+    );
+    assert_eq!(
+        touched(|it| it.placement.as_mut().unwrap().rti = 1),
+        ["rti/host"]
+    );
+    assert_eq!(
+        touched(|it| it.placement.as_mut().unwrap().hosts[1].engine = Engine::Docker),
+        ["host/pi"]
+    );
     assert_eq!(touched(|it| it.plan.keepalive = true), ["coordination"]);
-    assert_eq!(touched(|it| it.federates[0].needs = Needs { pids: Some(9), ..Needs::default() }), ["federate/a/needs"]);
-    assert_eq!(touched(|it| { it.federates[0].env.insert("A".into(), "1".into()); }), ["federate/a/environment"]);
+    assert_eq!(
+        touched(|it| it.federates[0].needs = Needs {
+            pids: Some(9),
+            ..Needs::default()
+        }),
+        ["federate/a/needs"]
+    );
+    assert_eq!(
+        touched(|it| {
+            it.federates[0].env.insert("A".into(), "1".into());
+        }),
+        ["federate/a/environment"]
+    );
     assert_eq!(touched(|it| it.settings.stop_grace *= 2), ["settings"]);
     let traced = Desired::of(&checked(), true, &mut file).unwrap();
     assert_ne!(traced.digest, desired(&checked()).digest);
@@ -143,12 +186,21 @@ fn what_matters_counts_where_it_belongs() {
 fn what_cannot_be_asked_for_says_why() {
     let mut nowhere = checked();
     nowhere.placement = None;
-    assert!(matches!(Desired::of(&nowhere, false, &mut file), Err(DesiredError::NoHosts)));
+    assert!(matches!(
+        Desired::of(&nowhere, false, &mut file),
+        Err(DesiredError::NoHosts)
+    ));
     let mut unbuilt = checked();
     unbuilt.federates.pop();
     let error = Desired::of(&unbuilt, false, &mut file).unwrap_err();
-    assert_eq!(error.to_string(), "federate `b` was not built; check with building");
+    assert_eq!(
+        error.to_string(),
+        "federate `b` was not built; check with building"
+    );
     let mut gone = |_: &Path| Err(io::Error::from(io::ErrorKind::NotFound));
     let error = Desired::of(&checked(), false, &mut gone).unwrap_err();
-    assert_eq!(error.to_string(), "cannot read the program of federate `a`, /home/ann/target/demo");
+    assert_eq!(
+        error.to_string(),
+        "cannot read the program of federate `a`, /home/ann/target/demo"
+    );
 }

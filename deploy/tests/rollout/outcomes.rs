@@ -24,13 +24,21 @@ fn failed(host: &str, rank: u8, at_ns: i64) -> PartOutcome {
 
 fn merged(parts: &[(&str, PartOutcome)]) -> Merged {
     let parts = parts.iter();
-    merge_outcomes(&parts.map(|(host, part)| ((*host).to_owned(), part.clone())).collect())
+    merge_outcomes(
+        &parts
+            .map(|(host, part)| ((*host).to_owned(), part.clone()))
+            .collect(),
+    )
 }
 
 #[test]
 fn the_lowest_rank_and_then_the_earliest_failure_is_told() {
     // `a` noticed first that the RTI was lost, but `c` had panicked.
-    let all = merged(&[("a", failed("a", 3, 1)), ("b", failed("b", 0, 9)), ("c", failed("c", 0, 7))]);
+    let all = merged(&[
+        ("a", failed("a", 3, 1)),
+        ("b", failed("b", 0, 9)),
+        ("c", failed("c", 0, 7)),
+    ]);
     let Some(Ended::Failed { cause, was_healthy }) = all.ended else {
         panic!("{all:?}");
     };
@@ -66,7 +74,9 @@ fn part() -> impl Strategy<Value = PartOutcome> {
         (0_i64..9).prop_map(|since_ns| PartOutcome::Unknown { since_ns }),
         Just(PartOutcome::Ended(Ended::Completed)),
         Just(PartOutcome::Ended(Ended::Aborted)),
-        Just(PartOutcome::Ended(Ended::Stopped { missed: BTreeSet::new() })),
+        Just(PartOutcome::Ended(Ended::Stopped {
+            missed: BTreeSet::new()
+        })),
         (0_u8..4, 0_i64..9).prop_map(|(rank, at_ns)| failed("h", rank, at_ns)),
     ]
 }

@@ -4,8 +4,8 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
 
 use ictus_deploy::rollout::{
-    Apply, Desired, Moment, Observed, Operation, Outcome, Phase, Plan, RunState, Step, plan,
-    plan_down,
+    Apply, Desired, Moment, Observed, Operation, Outcome, Phase, Plan, Refusal, RunState, Step,
+    plan, plan_down,
 };
 
 use super::Mutant;
@@ -26,7 +26,7 @@ pub(crate) enum Stage {
     Applying,
     /// There was nothing to do.
     Nothing,
-    Refused(String),
+    Refused(Refusal),
     Over(Phase),
 }
 
@@ -138,7 +138,7 @@ impl Cli {
         let plan = match plan {
             Ok(plan) => plan,
             Err(refusal) => {
-                self.stage = Stage::Refused(refusal.to_string());
+                self.stage = Stage::Refused(refusal);
                 return;
             }
         };
@@ -227,7 +227,11 @@ impl Cli {
             self.flights.extend(next);
         }
         let now = moment(world);
-        if self.applying().poll_timeout().is_some_and(|until| until <= now.elapsed) {
+        if self
+            .applying()
+            .poll_timeout()
+            .is_some_and(|until| until <= now.elapsed)
+        {
             self.applying().handle_timeout(now);
         }
         self.begin(world);

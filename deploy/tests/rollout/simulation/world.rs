@@ -397,7 +397,11 @@ fn told(name: &str, run: &There) -> Run {
     }
     Run {
         id: run.told_id(),
-        digest: if run.torn { String::new() } else { run.digest.clone() },
+        digest: if run.torn {
+            String::new()
+        } else {
+            run.digest.clone()
+        },
         facets: BTreeMap::new(),
         state: match run.life {
             Life::Prepared if run.torn => ended("its record is damaged"),
@@ -407,7 +411,11 @@ fn told(name: &str, run: &There) -> Run {
             Life::Ended => ended("stopped"),
         },
         members,
-        hosts: if run.torn { BTreeSet::new() } else { run.hosts.clone() },
+        hosts: if run.torn {
+            BTreeSet::new()
+        } else {
+            run.hosts.clone()
+        },
     }
 }
 
@@ -458,8 +466,8 @@ fn change(host: &mut Host, now_ms: u64, call: &Call) -> Result<(), String> {
         Operation::Prepare { previous } => prepare(host, now_ms, previous.as_ref(), call)?,
         Operation::CommitRti | Operation::Commit => {
             let there = host.run.as_mut();
-            let prepared = there
-                .filter(|run| run.id == call.run && run.life == Life::Prepared && !run.torn);
+            let prepared =
+                there.filter(|run| run.id == call.run && run.life == Life::Prepared && !run.torn);
             let run = prepared.ok_or("it is not prepared")?;
             run.life = Life::Starting;
             run.stream = Some(call.who.clone());
