@@ -118,7 +118,9 @@ pub(crate) fn dispatch(args: Vec<OsString>) -> ExitCode {
     if first == Some(OsStr::new(shim::COMMAND)) {
         return shim::exec(args.into_iter().skip(2));
     }
-    let args = if name == Some(OsStr::new("ictusd")) && first != Some(OsStr::new("dial-stdio")) {
+    // By that name it is the daemon, unless a command says otherwise.
+    let command = first.is_some_and(|first| !first.as_encoded_bytes().starts_with(b"-"));
+    let args = if name == Some(OsStr::new("ictusd")) && !command {
         vec![OsString::from("ictusd"), OsString::from("daemon")]
             .into_iter()
             .chain(args.into_iter().skip(1))

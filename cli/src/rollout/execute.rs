@@ -285,8 +285,8 @@ impl Executor {
                 }
             }
             Effect::Renewed => {
-                if let Outcome::Held { who } = outcome {
-                    self.apply.handle_fenced(step.host, who);
+                if let Outcome::Held { what } = outcome {
+                    self.apply.handle_fenced(step.host, what);
                 }
                 return;
             }
@@ -429,8 +429,8 @@ impl Executor {
                 let hint = format!("`ictus down {}` once they can be reached", self.federation);
                 Err(CliError::new(Kind::Partial, message).hint(hint))
             }
-            Phase::TakenOver { host, who } => {
-                let message = format!("host `{host}`: {who}; nothing more was changed");
+            Phase::TakenOver { host, what } => {
+                let message = format!("host `{host}`: {what}; nothing more was changed");
                 Err(CliError::new(Kind::Held, message))
             }
             Phase::Leasing
@@ -553,7 +553,7 @@ fn of_error(error: &ClientError) -> Outcome {
     let held = error.refusal().filter(|it| it.code == ErrorCode::Held);
     if let Some(refusal) = held {
         return Outcome::Held {
-            who: refusal.message.clone(),
+            what: refusal.message.clone(),
         };
     }
     let mut what = error.to_string();
