@@ -247,9 +247,19 @@ impl Apply {
         self.conclude();
     }
 
-    /// A host said, for instance when the lease was renewed, that somebody else has taken it since.
+    /// A host said, for instance when the lease was renewed, that somebody else has taken it since. Once every part is healthy,
+    /// or the lease is given back, that is as it should be.
     pub fn handle_fenced(&mut self, host: String, what: String) {
-        if !self.phase.is_over() {
+        let healthy = self.phase == Phase::Committing && self.healthy();
+        let mut releases = self
+            .tasks
+            .iter()
+            .filter(|task| task.step.operation == Operation::Release && task.step.host == host);
+        let released = releases.any(|task| match task.state {
+            State::Runs { .. } | State::Done | State::Failed => true,
+            State::Waits | State::Skipped => false,
+        });
+        if !self.phase.is_over() && !healthy && !released {
             self.phase = Phase::TakenOver { host, what };
         }
     }

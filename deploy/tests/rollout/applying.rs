@@ -281,6 +281,22 @@ fn an_interrupt_after_health_changes_nothing() {
 }
 
 #[test]
+fn a_lease_that_is_lost_after_health_or_given_back_is_no_news() {
+    let mut healthy = apply();
+    let releases = until(&mut healthy, "release");
+    healthy.handle_fenced("nuc".to_owned(), "lost".to_owned());
+    for step in &releases {
+        done(&mut healthy, step);
+    }
+    assert_eq!(*healthy.phase(), Phase::Done);
+    let mut undone = apply();
+    until(&mut undone, "prepare");
+    undone.handle_interrupt(at(0));
+    undone.handle_fenced("nuc".to_owned(), "lost".to_owned());
+    assert!(matches!(undone.phase(), Phase::TakenOver { .. }));
+}
+
+#[test]
 fn late_and_foreign_answers_are_not_heard() {
     let mut apply = apply();
     let lease = steps(&mut apply, at(0));

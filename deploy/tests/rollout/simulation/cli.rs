@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use ictus_deploy::rollout::{
     Apply, Desired, Moment, Observed, Operation, Outcome, Phase, Plan, Refusal, RunState, Step,
-    plan, plan_down,
+    StepId, plan, plan_down,
 };
 
 use super::Mutant;
@@ -355,8 +355,7 @@ fn mutated(mut plan: Plan, observed: &BTreeMap<String, Observed>, mutant: Option
         let changes = !matches!(step.operation, Operation::Lease | Operation::Release);
         let stops = matches!(step.operation, Operation::StopOld { .. });
         if mutant == Some(Mutant::EarlyStop) && stops {
-            let leases = observed.len();
-            step.needs.retain(|id| id.0 < leases);
+            step.needs = vec![StepId(observed.len() - 1)];
         }
         if mutant == Some(Mutant::PartialRestart) && changes && healthy(&step.host) {
             // A file that is there already stands for doing nothing.
