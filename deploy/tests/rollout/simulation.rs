@@ -157,7 +157,7 @@ fn one(seed: u64, fate: Fate, mutant: Option<Mutant>) -> u32 {
         changed_parameter(world, wanted);
     }
     converge(world, &Wish::Down { purge: true }, "down");
-    world.pass(world::TTL_MS);
+    world.settle();
     for (name, host) in &world.hosts {
         assert!(
             host.is_empty(),
@@ -170,7 +170,7 @@ fn one(seed: u64, fate: Fate, mutant: Option<Mutant>) -> u32 {
 /// Exactly what is wanted is there, and a second plan is empty. `exactly`: no other program is left either, which a change
 /// sees to when it ends.
 fn settled(world: &mut World, wanted: &Desired, exactly: bool) {
-    world.pass(world::TTL_MS);
+    world.settle();
     for (name, host) in &world.hosts {
         let run = host.run.as_ref();
         match wanted.hosts.get(name) {

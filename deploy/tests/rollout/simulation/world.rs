@@ -226,10 +226,7 @@ impl World {
     pub(crate) fn act(&mut self) {
         self.now_ms += self.rng.bits() % 300;
         if !self.late.is_empty() && self.rng.percent(20) {
-            let index = self.rng.below(self.late.len());
-            let call = self.late.swap_remove(index);
-            self.execute(&call);
-            self.hang_up(&call.step.host, &call.who);
+            self.arrive();
         }
         let names: Vec<String> = self.hosts.keys().cloned().collect();
         let name = &names[self.rng.below(names.len())];
@@ -237,6 +234,23 @@ impl World {
         if !self.calm && self.rng.percent(2) {
             self.restart(name);
         }
+    }
+
+    /// A call arrives after whoever made it has given it up.
+    fn arrive(&mut self) {
+        let index = self.rng.below(self.late.len());
+        let call = self.late.swap_remove(index);
+        self.execute(&call);
+        self.hang_up(&call.step.host, &call.who);
+    }
+
+    /// All that is on its way arrives, and leases that nobody renews end.
+    pub(crate) fn settle(&mut self) {
+        while !self.late.is_empty() {
+            self.arrive();
+            self.check();
+        }
+        self.pass(TTL_MS);
     }
 
     /// A part becomes healthy when all are started, and ends when another one has.
