@@ -247,8 +247,8 @@ impl Apply {
         self.conclude();
     }
 
-    /// A host said, for instance when the lease was renewed, that somebody else has taken it since. Once every part is healthy,
-    /// or the lease is given back, that is as it should be.
+    /// A host said, for instance when the lease was renewed, that somebody else has taken it since. Once every part is
+    /// healthy, or the lease is given back, that is as it should be.
     pub fn handle_fenced(&mut self, host: String, what: String) {
         let healthy = self.phase == Phase::Committing && self.healthy();
         let mut releases = self
@@ -264,8 +264,8 @@ impl Apply {
         }
     }
 
-    /// Whoever started it wants it to end: undoes what was prepared, stops what was started. The second time nothing more is
-    /// waited for. Once every part is healthy it changes nothing.
+    /// Whoever started it wants it to end: undoes what was prepared, stops what was started. The second time nothing
+    /// more is waited for. Once every part is healthy it changes nothing.
     pub fn handle_interrupt(&mut self, now: Moment) {
         match self.phase {
             Phase::Leasing | Phase::Preparing => {

@@ -193,7 +193,8 @@ pub fn plan(desired: &Desired, observed: &BTreeMap<String, Observed>) -> Result<
     Ok(plan)
 }
 
-/// What has to be done so that nothing of a federation runs on the hosts that were asked; `purge` leaves nothing else either.
+/// What has to be done so that nothing of a federation runs on the hosts that were asked; `purge` leaves nothing else
+/// either.
 ///
 /// # Errors
 /// As for [`plan`]; also when a run has a part on a host that was not asked.

@@ -31,7 +31,10 @@ pub enum Reason {
         run: String,
     },
     /// Programs are for another machine.
-    #[error("host `{host}` is {arch}, but the program of {federates} is for {program}", federates = listed("federate", federates))]
+    #[error(
+        "host `{host}` is {arch}, but the program of {federates} is for {program}",
+        federates = listed("federate", federates)
+    )]
     Architecture {
         /// The host.
         host: String,
@@ -81,7 +84,10 @@ pub enum Reason {
         what: String,
     },
     /// Somebody else is at it.
-    #[error("{who} holds the lease on host `{host}`, for another {seconds} s unless it is renewed", seconds = left_ms.div_ceil(1000))]
+    #[error(
+        "{who} holds the lease on host `{host}`, for another {seconds} s unless it is renewed",
+        seconds = left_ms.div_ceil(1000)
+    )]
     Held {
         /// The host.
         host: String,
@@ -91,7 +97,10 @@ pub enum Reason {
         left_ms: u64,
     },
     /// It gives no realtime scheduling.
-    #[error("host `{host}` gives no realtime scheduling, which {federates} needs", federates = listed("federate", federates))]
+    #[error(
+        "host `{host}` gives no realtime scheduling, which {federates} needs",
+        federates = listed("federate", federates)
+    )]
     Realtime {
         /// The host.
         host: String,

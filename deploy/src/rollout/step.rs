@@ -63,8 +63,8 @@ pub enum Operation {
     Commit,
     /// Waits until the part is healthy.
     AwaitHealthy,
-    /// Undoes a part of the new run that was not begun: when another run is there, or none, nothing happens. A record that is
-    /// damaged is the new run's: the one that was there before does not run any more.
+    /// Undoes a part of the new run that was not begun: when another run is there, or none, nothing happens. A record
+    /// that is damaged is the new run's: the one that was there before does not run any more.
     RemovePart {
         /// The new run's id.
         run: String,

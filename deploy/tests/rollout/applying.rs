@@ -34,11 +34,10 @@ fn words(steps: &[Step]) -> Vec<String> {
 }
 
 fn done(apply: &mut Apply, step: &Step) {
-    let outcome = match step.operation {
-        Operation::Lease => Outcome::Leased {
-            run: Some("r1".to_owned()),
-        },
-        _ => Outcome::Done,
+    let run = Some("r1".to_owned());
+    let outcome = match step.operation == Operation::Lease {
+        true => Outcome::Leased { run },
+        false => Outcome::Done,
     };
     apply.handle_done(at(0), step.id, outcome);
 }

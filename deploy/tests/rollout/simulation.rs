@@ -229,7 +229,7 @@ fn attempt(seed: u64, fate: Fate, mutant: Option<Mutant>) -> Result<u32, String>
         let what = panic.downcast_ref::<String>().cloned();
         let what = what.or_else(|| panic.downcast_ref::<&str>().map(|&it| it.to_owned()));
         format!(
-            "seed {seed}, {fate:?}: {}\nrepeat: ROLLOUT_SEEDS={seed}..{} cargo nextest run -p ictus-deploy --test rollout simulation",
+            "seed {seed}, {fate:?}: {}\nrepeat: ROLLOUT_SEEDS={seed}..{} cargo nextest run -p ictus-deploy simulation",
             what.unwrap_or_default(),
             seed + 1
         )

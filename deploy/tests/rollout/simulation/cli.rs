@@ -171,9 +171,10 @@ impl Cli {
                 self.flights.push(Flight::Watches(step));
                 continue;
             }
-            let number = match step.operation {
-                Operation::Release => self.numbers.remove(&step.host),
-                _ => self.numbers.get(&step.host).copied(),
+            // What is given back is not renewed any more.
+            let number = match step.operation == Operation::Release {
+                true => self.numbers.remove(&step.host),
+                false => self.numbers.get(&step.host).copied(),
             };
             let call = Call {
                 who: self.who.clone(),
@@ -299,15 +300,14 @@ impl Cli {
         {
             return Outcome::Done;
         }
-        match world.execute(call) {
-            Outcome::Leased { run } => Outcome::Leased {
-                run: run.filter(|_| {
-                    world.mutant != Some(Mutant::AbsentWhenUnreachable)
-                        || self.observed[host].run().is_some()
-                }),
-            },
-            outcome => outcome,
+        let mut outcome = world.execute(call);
+        if let Outcome::Leased { run } = &mut outcome
+            && world.mutant == Some(Mutant::AbsentWhenUnreachable)
+            && self.observed[host].run().is_none()
+        {
+            *run = None;
         }
+        outcome
     }
 
     /// Leases last as long as somebody is awake.
