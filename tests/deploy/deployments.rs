@@ -148,7 +148,10 @@ fn target(host: &Host) -> String {
 fn hosts(rig: &Rig, more: &str) -> String {
     let line = |host: &Host| format!("  {}: {{ ssh: \"{}\"{more} }}\n", host.name, target(host));
     let lines: String = rig.hosts().iter().map(line).collect();
-    format!("hosts:\n{lines}security: trusted-network\n")
+    format!(
+        "hosts:\n{lines}security: trusted-network\nrti: {{ host: {} }}\n",
+        rig.hosts()[0].name
+    )
 }
 
 /// A manifest of compose/ with `hosts`, its federates dealt out to them in turn.
@@ -291,7 +294,7 @@ fn a_killed_daemon_of_a_host_adopts(rig: &Rig) {
         let more = format!(", engine: {engine}");
         let file = operator.manifest("diamond.yaml", &spread(rig, "diamond", &hosts(rig, &more)));
         operator.ok(&["up", &file, "--set", "run=5 s", "--trace"]);
-        rig.hosts()[1].exec(&["pkill", "-KILL", "-f", "ictusd daemon"]);
+        rig.hosts()[1].exec(&["pkill", "-KILL", "-f", "[i]ctusd daemon"]);
         let parts = operator.parts(&file);
         assert!(
             parts.iter().all(|part| part["state"] == "running"),
@@ -388,7 +391,7 @@ fn a_federate_that_exits_at_once_undoes_all_hosts(rig: &Rig) {
     let text = format!(
         "ictus: v1\nfederation: faulty\n{}programs:\n  canary: {{ package: {} }}\nfederates:\n  \
          faulty: {{ host: h2, class: Faulty, parameters: {{ at: 0 ms }} }}\n  watcher: {{ host: h1, class: Watcher }}\n\
-         rti: {{ host: h1 }}\n",
+         ",
         hosts(rig, ""),
         canary.display()
     );

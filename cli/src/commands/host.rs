@@ -16,8 +16,14 @@ use crate::rollout::size;
 use crate::session::Session;
 use crate::ui::Ui;
 
-/// The directories that `add` makes, innermost first.
-const DIRECTORIES: [&str; 2] = [".local/share/ictus/bin", ".local/share/ictus"];
+/// The directories that `add` and the daemon make, innermost first.
+const DIRECTORIES: [&str; 5] = [
+    ".local/share/ictus/bin",
+    ".local/share/ictus",
+    ".local/share",
+    ".local/state",
+    ".local",
+];
 
 /// Get hosts ready for federations, look at them, and leave them as they were
 #[derive(Debug, Args)]

@@ -294,6 +294,9 @@ impl Executor {
         if outcome == Outcome::Done {
             self.say(ui, &step);
         }
+        if step.operation == Operation::Release {
+            self.fences.remove(&step.host);
+        }
         if step.operation == Operation::CommitRti {
             self.listening = None;
         }
@@ -537,7 +540,8 @@ impl Call {
 
     async fn is_there(&self, run: &str) -> Result<bool, ClientError> {
         let view = view(&self.client, &self.federation).await?;
-        Ok(view.is_some_and(|view| view.id == run))
+        // One whose record is damaged has no id, and may be this one.
+        Ok(view.is_some_and(|view| view.id == run || view.id.is_empty()))
     }
 
     async fn remove(&self, purge: bool) -> Result<(), ClientError> {
