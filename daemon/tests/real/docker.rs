@@ -13,7 +13,7 @@ use std::thread;
 
 use ictus_deploy::image::elf::Machine;
 use ictus_deploy::{Engine, Needs};
-use ictusd::api::part::{HostRef, Part};
+use ictusd::api::part::{CommitRequest, HostRef, LeaseRequest, Part, PrepareRequest};
 use ictusd::api::{Event, Failure, FailureKind, Outcome, StartRequest, State};
 use ictusd::identity::random_id;
 
@@ -417,6 +417,47 @@ async fn another_user_runs_a_federate() {
     assert_eq!(rig.containers(), [""; 0]);
     world.client.remove(&rig.name, true).await.unwrap();
     assert!(!world.directory(&rig.name).exists());
+}
+
+#[tokio::test]
+async fn images_are_made_before_anything_runs() {
+    let Some(rig) = Rig::new() else { return };
+    let world = rig.world().await;
+    let name = rig.name.as_str();
+    let asks = LeaseRequest {
+        who: "a test".to_owned(),
+        ttl_ms: 600_000,
+    };
+    let fence = world.client.lease(name, &asks).await.unwrap().fence;
+    let mut prepare = PrepareRequest {
+        previous: None,
+        id: "run-1".to_owned(),
+        digest: String::new(),
+        facets: BTreeMap::new(),
+        request: rig.request(&[("a", ""), ("b", "")]),
+    };
+    prepare.request.federates[1].needs.image = Some("no-such-image:1".to_owned());
+    let refused = world.client.prepare((name, fence), &prepare).await;
+    let why = refused.unwrap_err().to_string();
+    assert!(
+        why.contains("host `here`") && why.contains("image no-such-image:1 is not on this host"),
+        "{why}"
+    );
+    prepare.request = rig.request(&[("a", ""), ("b", "")]);
+    world.client.prepare((name, fence), &prepare).await.unwrap();
+    let made = rig.images();
+    assert_eq!((made.len(), rig.containers()), (1, Vec::new()));
+    let commit = CommitRequest {
+        fence,
+        id: "run-1".to_owned(),
+        rti: None,
+    };
+    let mut stream = world.client.commit(name, &commit).await.unwrap();
+    while next(&mut stream).await.event != Event::Healthy {}
+    assert_eq!(rig.containers(), ["a", "b", "rti"]);
+    assert_eq!(rig.images(), made);
+    world.client.remove_part((name, fence), true).await.unwrap();
+    assert_eq!((rig.containers(), rig.images()), (Vec::new(), Vec::new()));
 }
 
 /// A socket before the engine's, which can be closed as a stopped engine's is.
