@@ -215,6 +215,7 @@ impl Connection {
         ))
     }
 
+    /// Runs `true`, so that what is wrong shows now.
     async fn open_system(
         target: &Target,
         options: &Options,
@@ -223,7 +224,13 @@ impl Connection {
         let system = Arc::new(System::new(target, options).await?);
         let route = system.route().clone();
         let connection = Self::new(&route, None, remarks, options, Way::System(system));
-        match connection.run(&["true"], b"").await {
+        // The same bound as the built-in client has: connection, then keys and user.
+        let bound = options.connect_timeout * 3;
+        let first = async {
+            let channel = connection.exec(&["true"]).await?;
+            connection.finish(channel, "true", Vec::new(), bound).await
+        };
+        match first.await {
             Ok(_) => Ok(connection),
             Err(SshError::UnknownHostKey {
                 host,
@@ -296,7 +303,8 @@ impl Connection {
     /// [`SshError::Timeout`] after [`Options::command_timeout`], [`SshError::Remote`] when it writes more than 16 MiB; an exit code is none.
     pub async fn run(&self, command: &[&str], stdin: &[u8]) -> Result<Output, SshError> {
         let channel = self.exec(command).await?;
-        self.finish(channel, &command.join(" "), stdin.to_vec())
+        let line = command.join(" ");
+        self.finish(channel, &line, stdin.to_vec(), self.bound())
             .await
     }
 
@@ -378,6 +386,7 @@ impl Connection {
         mut channel: Channel,
         command: &str,
         stdin: Vec<u8>,
+        bound: Duration,
     ) -> Result<Output, SshError> {
         let whole = async {
             let (mut from, mut to) = tokio::io::split(&mut channel);
@@ -401,9 +410,13 @@ impl Connection {
             }
             channel.end().await.map(|end| (stdout, end))
         };
-        let (stdout, end) = timeout(self.bound(), whole)
+        let (stdout, end) = timeout(bound, whole)
             .await
-            .map_err(|_| self.late(&format!("running `{command}`")))??;
+            .map_err(|_| SshError::Timeout {
+                host: self.peer().to_string(),
+                doing: format!("running `{command}`"),
+                seconds: bound.as_secs(),
+            })??;
         let mut stderr = end.stderr;
         if let Some(signal) = end.signal {
             stderr.extend(format!("\nended by signal {signal}\n").into_bytes());

@@ -63,21 +63,26 @@ pub(super) struct Pipe {
 
 #[derive(Default)]
 struct State {
-    /// From the host.
-    inbound: VecDeque<u8>,
-    inbound_over: bool,
-    reader: Option<Waker>,
-    /// To the host.
-    outbound: VecDeque<u8>,
-    /// No more will be written.
+    /// From the host to the reader.
+    inbound: Way,
+    /// From the writer to the host.
+    outbound: Way,
+    /// The writer has closed its side.
     shut: bool,
-    /// The host takes no more.
-    outbound_over: bool,
-    writer: Option<Waker>,
     stderr: VecDeque<u8>,
     end: Option<Result<End, SshError>>,
     waiter: Option<Waker>,
     abandoned: bool,
+}
+
+/// One direction.
+#[derive(Default)]
+struct Way {
+    bytes: VecDeque<u8>,
+    /// The host gives or takes no more.
+    over: bool,
+    /// The user that waits for bytes or for room.
+    waker: Option<Waker>,
 }
 
 impl Pipe {
@@ -100,14 +105,17 @@ impl Pipe {
         buf: &mut ReadBuf<'_>,
     ) -> Poll<io::Result<()>> {
         let mut state = self.state();
-        let was_full = state.inbound.len() >= BUFFER_MAX / 2;
+        let was_full = state.inbound.bytes.len() >= BUFFER_MAX / 2;
         let mut taken = 0;
-        for part in [state.inbound.as_slices().0, state.inbound.as_slices().1] {
+        for part in [
+            state.inbound.bytes.as_slices().0,
+            state.inbound.bytes.as_slices().1,
+        ] {
             let part = &part[..part.len().min(buf.remaining())];
             buf.put_slice(part);
             taken += part.len();
         }
-        state.inbound.drain(..taken);
+        state.inbound.bytes.drain(..taken);
         if taken > 0 || buf.remaining() == 0 {
             if was_full {
                 self.bell.ring();
@@ -120,10 +128,10 @@ impl Pipe {
                 error.clone(),
             )));
         }
-        if state.inbound_over {
+        if state.inbound.over {
             return Poll::Ready(Ok(()));
         }
-        state.reader = Some(cx.waker().clone());
+        state.inbound.waker = Some(cx.waker().clone());
         Poll::Pending
     }
 
@@ -132,13 +140,13 @@ impl Pipe {
         if let Some(error) = state.broken() {
             return Poll::Ready(Err(error));
         }
-        let room = BUFFER_MAX.saturating_sub(state.outbound.len());
+        let room = BUFFER_MAX.saturating_sub(state.outbound.bytes.len());
         if room == 0 && !bytes.is_empty() {
-            state.writer = Some(cx.waker().clone());
+            state.outbound.waker = Some(cx.waker().clone());
             return Poll::Pending;
         }
         let taken = room.min(bytes.len());
-        state.outbound.extend(&bytes[..taken]);
+        state.outbound.bytes.extend(&bytes[..taken]);
         drop(state);
         self.bell.ring();
         Poll::Ready(Ok(taken))
@@ -147,13 +155,13 @@ impl Pipe {
     /// Ready when the thread has taken everything.
     pub(super) fn poll_flush(&self, cx: &Context<'_>) -> Poll<io::Result<()>> {
         let mut state = self.state();
-        if state.outbound.is_empty() {
+        if state.outbound.bytes.is_empty() {
             return Poll::Ready(Ok(()));
         }
         if let Some(error) = state.broken() {
             return Poll::Ready(Err(error));
         }
-        state.writer = Some(cx.waker().clone());
+        state.outbound.waker = Some(cx.waker().clone());
         Poll::Pending
     }
 
@@ -166,8 +174,8 @@ impl Pipe {
     pub(super) fn abandon(&self) {
         let mut state = self.state();
         state.abandoned = true;
-        state.inbound.clear();
-        state.outbound.clear();
+        state.inbound.bytes.clear();
+        state.outbound.bytes.clear();
         drop(state);
         self.bell.ring();
     }
@@ -189,15 +197,15 @@ impl Pipe {
 
     /// How much may be put in.
     pub(super) fn room(&self) -> usize {
-        BUFFER_MAX.saturating_sub(self.state().inbound.len())
+        BUFFER_MAX.saturating_sub(self.state().inbound.bytes.len())
     }
 
     pub(super) fn put(&self, bytes: &[u8]) {
         let mut state = self.state();
         if !state.abandoned {
-            state.inbound.extend(bytes);
+            state.inbound.bytes.extend(bytes);
         }
-        wake(&mut state.reader);
+        wake(&mut state.inbound.waker);
     }
 
     pub(super) fn put_stderr(&self, bytes: &[u8]) {
@@ -210,26 +218,26 @@ impl Pipe {
     /// Moves up to `max` bytes into `chunk`; whether the end of what will be written is reached.
     pub(super) fn take(&self, chunk: &mut Vec<u8>, max: usize) -> bool {
         let mut state = self.state();
-        let count = state.outbound.len().min(max);
-        chunk.extend(state.outbound.drain(..count));
+        let count = state.outbound.bytes.len().min(max);
+        chunk.extend(state.outbound.bytes.drain(..count));
         if count > 0 {
-            wake(&mut state.writer);
+            wake(&mut state.outbound.waker);
         }
-        state.shut && state.outbound.is_empty()
+        state.shut && state.outbound.bytes.is_empty()
     }
 
     /// The host has sent everything.
     pub(super) fn end_inbound(&self) {
         let mut state = self.state();
-        state.inbound_over = true;
-        wake(&mut state.reader);
+        state.inbound.over = true;
+        wake(&mut state.inbound.waker);
     }
 
     /// The command has ended, or the connection has.
     pub(super) fn end(&self, end: Result<(Option<i32>, Option<String>), SshError>) {
         let mut state = self.state();
-        state.outbound_over = true;
-        state.outbound.clear();
+        state.outbound.over = true;
+        state.outbound.bytes.clear();
         if state.end.is_none() {
             let stderr = state.stderr.iter().copied().collect();
             state.end = Some(end.map(|(code, signal)| End {
@@ -238,9 +246,9 @@ impl Pipe {
                 stderr,
             }));
         }
-        state.inbound_over = true;
-        wake(&mut state.reader);
-        wake(&mut state.writer);
+        state.inbound.over = true;
+        wake(&mut state.inbound.waker);
+        wake(&mut state.outbound.waker);
         wake(&mut state.waiter);
     }
 }
@@ -253,7 +261,7 @@ impl State {
                 error.clone(),
             ));
         }
-        let closed = self.outbound_over || self.shut;
+        let closed = self.outbound.over || self.shut;
         closed.then(|| io::Error::new(io::ErrorKind::BrokenPipe, "the command takes no more input"))
     }
 }

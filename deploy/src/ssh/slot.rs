@@ -80,6 +80,15 @@ enum Step {
     Over,
 }
 
+/// What libssh2 may have begun to send for this channel, so that it must be called again before anything else.
+#[derive(Clone, Copy, Debug, Default)]
+struct Begun {
+    /// A packet of the chunk.
+    packet: bool,
+    /// A widening of the window.
+    window: bool,
+}
+
 /// A channel and where it is in its life.
 pub(super) struct Slot {
     channel: Channel,
@@ -89,10 +98,7 @@ pub(super) struct Slot {
     /// What libssh2 is writing: it must not change before it is through.
     chunk: Vec<u8>,
     written: usize,
-    /// libssh2 has begun a packet of `chunk`.
-    in_flight: bool,
-    /// libssh2 may have begun to widen the window.
-    widening: bool,
+    begun: Begun,
     eof_sent: bool,
     eof_seen: bool,
     _permit: OwnedSemaphorePermit,
@@ -114,8 +120,7 @@ impl Slot {
             step,
             chunk: Vec::new(),
             written: 0,
-            in_flight: false,
-            widening: false,
+            begun: Begun::default(),
             eof_sent: false,
             eof_seen: false,
             _permit: request.permit,
@@ -234,7 +239,7 @@ impl Slot {
     fn write_chunk(&mut self) -> Result<Turn, String> {
         match blocked(self.channel.write(&self.chunk[self.written..]))? {
             Some(count) if count > 0 => {
-                self.in_flight = false;
+                self.begun.packet = false;
                 self.written += count;
                 if self.written == self.chunk.len() {
                     self.chunk.clear();
@@ -244,8 +249,8 @@ impl Slot {
             }
             Some(_) | None => {
                 // With the host's window closed nothing was begun: that waits for the host, not for the socket.
-                self.in_flight = self.channel.write_window().remaining > 0;
-                Ok(Turn::sending(self.in_flight))
+                self.begun.packet = self.channel.write_window().remaining > 0;
+                Ok(Turn::sending(self.begun.packet))
             }
         }
     }
@@ -269,7 +274,7 @@ impl Slot {
             };
         }
         let read = blocked(self.channel.read(&mut scratch[..room]))?;
-        self.widening = read.is_none();
+        self.begun.window = read.is_none();
         match read {
             Some(0) | None => {
                 if self.channel.eof() {
@@ -287,14 +292,14 @@ impl Slot {
     }
 
     fn close(&mut self, scratch: &mut [u8], writable: bool, late: bool) -> Result<Turn, String> {
-        if self.widening {
+        if self.begun.window {
             // One read to its end finishes what it may have begun; what comes is not wanted any more.
-            self.widening = blocked(self.channel.read(scratch))?.is_none() && !writable;
-            if self.widening {
+            self.begun.window = blocked(self.channel.read(scratch))?.is_none() && !writable;
+            if self.begun.window {
                 return Ok(Turn::sending(true));
             }
         }
-        if self.in_flight {
+        if self.begun.packet {
             return self.write_chunk();
         }
         if !writable && !late {

@@ -117,44 +117,40 @@ impl System {
 
     /// What `ssh` itself failed at, from what it printed; none when the command's own exit code was 255.
     fn classify(&self, text: &str) -> Option<SshError> {
-        let host = self.route.name();
-        let line_with = |part: &str| {
-            text.lines()
-                .find(|line| line.contains(part))
-                .map(|line| line.trim().to_owned())
-        };
-        let any = |parts: &[&str]| parts.iter().find_map(|part| line_with(part));
         if text.contains("REVOKED HOST KEY") || text.contains("is marked as revoked") {
             return Some(self.revoked());
         }
         if text.contains("REMOTE HOST IDENTIFICATION HAS CHANGED") {
             return Some(self.changed(text));
         }
-        if let Some(line) = any(&["host key is known for", "Host key verification failed"]) {
+        let unknown = ["host key is known for", "Host key verification failed"];
+        if let Some(line) = line_with(text, &unknown) {
+            let kind = line
+                .strip_prefix("No ")
+                .and_then(|rest| rest.split(' ').next());
+            let file = self.route.known_hosts.first();
             return Some(SshError::UnknownHostKey {
                 host: self.known_name(),
-                kind: line
-                    .split(' ')
-                    .nth(1)
-                    .filter(|_| line.starts_with("No "))
-                    .unwrap_or_default()
-                    .to_owned(),
+                kind: kind.unwrap_or_default().to_owned(),
                 fingerprint: "that ssh does not print".to_owned(),
-                known_hosts: self
-                    .route
-                    .known_hosts
-                    .first()
-                    .map_or_else(String::new, |file| file.display().to_string()),
+                known_hosts: file.map_or_else(String::new, |file| file.display().to_string()),
             });
         }
-        if let Some(line) = any(&["Permission denied (", "Too many authentication failures"]) {
+        let denied = ["Permission denied (", "Too many authentication failures"];
+        if let Some(line) = line_with(text, &denied) {
             return Some(SshError::Auth {
-                host,
+                host: self.route.name(),
                 user: self.route.user.clone(),
                 tried: format!("what the system's ssh tries: {line}"),
             });
         }
-        if any(&["Connection timed out", "Operation timed out"]).is_some() {
+        self.classify_network(text)
+    }
+
+    /// The part of [`Self::classify`] that is about the way and the protocol.
+    fn classify_network(&self, text: &str) -> Option<SshError> {
+        let host = self.route.name();
+        if line_with(text, &["Connection timed out", "Operation timed out"]).is_some() {
             return Some(SshError::Timeout {
                 host,
                 doing: "connecting".to_owned(),
@@ -167,7 +163,7 @@ impl System {
             "No route to host",
             "Network is unreachable",
         ];
-        if let Some(cause) = any(&unreachable) {
+        if let Some(cause) = line_with(text, &unreachable) {
             return Some(SshError::Unreachable { host, cause });
         }
         let closed = [
@@ -175,10 +171,9 @@ impl System {
             "Connection reset by",
             "kex_exchange_identification",
             "not responding",
-            "Broken pipe",
-            "disconnect",
+            "client_loop: send disconnect",
         ];
-        if let Some(cause) = any(&closed) {
+        if let Some(cause) = line_with(text, &closed) {
             return Some(SshError::Closed { host, cause });
         }
         let refused = [
@@ -186,7 +181,7 @@ impl System {
             "channel 0: open failed",
             "exec request failed",
         ];
-        any(&refused).map(|cause| SshError::Refused {
+        line_with(text, &refused).map(|cause| SshError::Refused {
             host,
             what: "the system's ssh".to_owned(),
             cause,
@@ -370,6 +365,15 @@ fn known_hosts_option(files: &[PathBuf]) -> String {
     format!("UserKnownHostsFile={}", quoted.join(" "))
 }
 
+/// The first line that has the first of these parts that occurs.
+fn line_with(text: &str, parts: &[&str]) -> Option<String> {
+    let line = |part: &&str| text.lines().find(|line| line.contains(part));
+    parts
+        .iter()
+        .find_map(line)
+        .map(|line| line.trim().to_owned())
+}
+
 /// Keeps the last bytes of a stream.
 async fn keep_tail(mut stream: impl AsyncRead + Unpin, kept: Arc<Mutex<VecDeque<u8>>>) {
     let mut chunk = vec![0; 8 << 10];
@@ -388,9 +392,10 @@ fn tail(kept: &Mutex<VecDeque<u8>>) -> std::sync::MutexGuard<'_, VecDeque<u8>> {
 fn missing(error: &std::io::Error) -> SshError {
     SshError::Local {
         what: "cannot run the system's `ssh`".to_owned(),
-        cause: match error.kind() {
-            ErrorKind::NotFound => "it is not installed: `sudo apt-get install openssh-client`, or leave `client: system` out".to_owned(),
-            _ => error.to_string(),
+        cause: if error.kind() == ErrorKind::NotFound {
+            "it is not installed: `sudo apt-get install openssh-client`, or leave `client: system` out".to_owned()
+        } else {
+            error.to_string()
         },
     }
 }

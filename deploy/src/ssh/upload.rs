@@ -88,7 +88,9 @@ impl Connection {
             sent += u64::try_from(count).unwrap_or_default();
             progress(sent);
         }
-        let output = self.finish(channel, &command.join(" "), Vec::new()).await?;
+        let output = self
+            .finish(channel, &command.join(" "), Vec::new(), self.bound())
+            .await?;
         match broken {
             None if output.code == 0 => Ok(()),
             None => Err(self.failed(&command, &output)),
