@@ -563,7 +563,7 @@ impl Agent {
     /// Whether no federate is left for which this host's members would stay.
     fn nothing_left(&self) -> bool {
         let some_elsewhere = self.federates.iter().any(|member| !member.here);
-        !self.federates.iter().any(Member::lives) && !(self.rti.lives() && some_elsewhere)
+        !(self.federates.iter().any(Member::lives) || self.rti.lives() && some_elsewhere)
     }
 
     fn launch(&mut self, member: MemberId) {

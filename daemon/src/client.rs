@@ -58,8 +58,11 @@ enum Way {
 /// Makes connections to the daemon of another host.
 pub trait Dial: fmt::Debug + Send + Sync {
     /// One connection, over which the daemon already answers.
-    fn dial(&self) -> Pin<Box<dyn Future<Output = io::Result<Box<dyn Duplex>>> + Send + '_>>;
+    fn dial(&self) -> Dialled<'_>;
 }
+
+/// A connection that is on its way.
+pub type Dialled<'a> = Pin<Box<dyn Future<Output = io::Result<Box<dyn Duplex>>> + Send + 'a>>;
 
 /// Bytes in both directions.
 pub trait Duplex: AsyncRead + AsyncWrite + Send + Unpin {}

@@ -481,13 +481,13 @@ fn socket(host: Option<String>) -> Result<PathBuf, EngineError> {
 
 fn unreachable(socket: &Path, error: &io::Error) -> EngineError {
     let socket = socket.to_path_buf();
-    match error.kind() {
-        io::ErrorKind::NotFound => EngineError::Absent { socket },
-        io::ErrorKind::PermissionDenied => EngineError::Denied {
-            socket,
-            uid: rustix::process::geteuid().as_raw(),
-        },
-        _ => EngineError::Stopped { socket },
+    if error.kind() == io::ErrorKind::NotFound {
+        EngineError::Absent { socket }
+    } else if error.kind() == io::ErrorKind::PermissionDenied {
+        let uid = rustix::process::geteuid().as_raw();
+        EngineError::Denied { socket, uid }
+    } else {
+        EngineError::Stopped { socket }
     }
 }
 

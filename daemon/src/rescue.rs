@@ -17,6 +17,7 @@ use crate::supervisor::spec::{PROTOCOL, Spec};
 
 /// Makes the record again from the request, the supervisors' specs and the events; absent when they do not
 /// tell enough.
+#[expect(clippy::too_many_lines, reason = "an arm for each event")]
 pub(crate) fn record(name: &str, directory: &Directory) -> Option<Record> {
     let request = directory.read_request().ok()?;
     let mut members = BTreeMap::new();

@@ -515,7 +515,8 @@ mod tests {
     fn flags_of_the_user_are_kept() {
         let own = "CARGO_TARGET_X86_64_UNKNOWN_LINUX_GNU_RUSTFLAGS";
         let ours = "-C target-feature=+crt-static";
-        let table: &[(&[(&str, &str)], &str, String)] = &[
+        type Row<'a> = (&'a [(&'a str, &'a str)], &'a str, String);
+        let table: &[Row<'_>] = &[
             (&[], own, ours.to_owned()),
             (&[(own, "-g")], own, format!("-g {ours}")),
             (

@@ -260,6 +260,7 @@ fn a_breakdown_names_every_term() {
 
 /// Which member runs where, and what it needs there.
 #[test]
+#[expect(clippy::too_many_lines, reason = "every key of the example")]
 fn the_example_is_placed() {
     let bench = Bench::new(&example());
     let checked = bench

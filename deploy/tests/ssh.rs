@@ -1,6 +1,12 @@
 //! The way to other hosts, against a real sshd: what holds for both methods, and each trap of libssh2.
 #![cfg(feature = "ssh")]
-#![expect(clippy::unwrap_used, reason = "a test stops at the first surprise")]
+#![expect(
+    clippy::unwrap_used,
+    clippy::panic,
+    clippy::wildcard_enum_match_arm,
+    clippy::print_stdout,
+    reason = "a test stops at the first surprise"
+)]
 
 #[path = "ssh/rig.rs"]
 mod rig;

@@ -3,13 +3,12 @@
 use std::fmt;
 use std::io;
 use std::path::Path;
-use std::pin::Pin;
 use std::sync::Arc;
 use std::time::Duration;
 
 use ictus_deploy::placement::SshClient;
 use ictus_deploy::ssh::{Connection, Method, Options, SshError, Target};
-use ictusd::client::{Client, Dial, Duplex};
+use ictusd::client::{Client, Dial, Dialled, Duplex};
 use tokio::io::AsyncReadExt;
 
 use super::INSTALLED;
@@ -124,7 +123,7 @@ impl Host {
 }
 
 impl Dial for Host {
-    fn dial(&self) -> Pin<Box<dyn Future<Output = io::Result<Box<dyn Duplex>>> + Send + '_>> {
+    fn dial(&self) -> Dialled<'_> {
         Box::pin(self.greeted())
     }
 }

@@ -314,6 +314,10 @@ impl Contained {
 
 /// What has a container's name.
 #[derive(Debug)]
+#[expect(
+    clippy::large_enum_variant,
+    reason = "one at a time, and gone when it is looked at"
+)]
 pub(super) enum Found {
     /// No container.
     Nothing,

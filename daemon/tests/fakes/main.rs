@@ -6,6 +6,7 @@
     clippy::print_stderr,
     clippy::exit,
     clippy::zombie_processes,
+    clippy::too_many_lines,
     reason = "a test program"
 )]
 

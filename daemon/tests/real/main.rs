@@ -3,6 +3,8 @@
     clippy::unwrap_used,
     clippy::panic,
     clippy::wildcard_enum_match_arm,
+    clippy::print_stderr,
+    clippy::too_many_lines,
     missing_docs,
     reason = "tests"
 )]

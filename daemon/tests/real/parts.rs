@@ -340,7 +340,11 @@ async fn bytes_of_another_digest_are_refused() {
     assert_eq!(code, ErrorCode::BadRequest);
     assert!(message.contains(&wrong), "{message}");
     assert_eq!(
-        world.client.missing_blobs(&[wrong.clone()]).await.unwrap(),
+        world
+            .client
+            .missing_blobs(std::slice::from_ref(&wrong))
+            .await
+            .unwrap(),
         [wrong]
     );
 }
