@@ -256,7 +256,7 @@ fn autoware_runs_in_containers_over_three_hosts(rig: &Rig) {
         let planned = operator.run(&[&["plan", &file][..], &run].concat());
         assert_eq!(planned.status.code(), Some(2), "{}", said(&planned));
         let up = operator.ok(&[&["up", &file, "--trace"][..], &run].concat());
-        assert!(up.contains("healthy"), "{up}");
+        tell(coordination, &up);
         verify(&operator, &file, "autoware", "autoware");
         operator.ok(&["down", &file, "--purge"]);
     }
@@ -266,26 +266,30 @@ fn autoware_runs_in_containers_over_three_hosts(rig: &Rig) {
 fn the_diamond_runs_as_processes_over_three_hosts(rig: &Rig) {
     let operator = Operator::with_hosts(rig);
     let file = operator.manifest("diamond.yaml", &spread(rig, "diamond", &hosts(rig, "")));
-    let run = ["--set", "run=3 s", "--trace"];
-    let first = operator.ok(&[&["up", &file][..], &run].concat());
-    assert!(first.contains("healthy"), "{first}");
+    let first = operator.ok(&["up", &file, "--set", "run=1 h", "--trace"]);
+    tell("first", &first);
     // While it runs there is nothing to do.
-    let again = operator.ok(&[&["up", &file][..], &run].concat());
+    let again = operator.ok(&["up", &file, "--set", "run=1 h", "--trace"]);
     assert!(again.contains("already running"), "{again}");
-    verify(&operator, &file, "diamond", "diamond");
-    // Another parameter: everybody restarts, and no program is sent.
-    let again = operator.ok(&["up", &file, "--set", "run=2 s", "--trace"]);
-    assert!(again.contains("0 B sent"), "{again}");
+    operator.ok(&["plan", &file, "--set", "run=1 h"]);
+    // Another parameter: everybody restarts at a planned stop, and no program is sent.
+    let changed = operator.ok(&["up", &file, "--set", "run=3 s", "--trace"]);
+    assert!(changed.contains("restart together at a planned stop"), "{changed}");
+    assert!(changed.contains("0 B sent"), "{changed}");
+    tell("changed", &changed);
     verify(&operator, &file, "diamond", "diamond");
     // Without the manifest, from any machine that knows one host.
-    operator.ok(&[
-        "down",
-        "diamond",
-        "--host",
-        &target(&rig.hosts()[1]),
-        "--purge",
-    ]);
+    let host = target(&rig.hosts()[1]);
+    operator.ok(&["down", "diamond", "--host", &host, "--purge"]);
     operator.leave();
+}
+
+/// The figures of a start.
+#[expect(clippy::print_stdout, reason = "a test's report")]
+fn tell(what: &str, up: &str) {
+    for line in up.lines().filter(|line| line.starts_with("sent ") || line.starts_with("healthy ")) {
+        println!("  {what}: {line}");
+    }
 }
 
 fn a_killed_daemon_of_a_host_adopts(rig: &Rig) {
@@ -293,7 +297,7 @@ fn a_killed_daemon_of_a_host_adopts(rig: &Rig) {
     for engine in ["process", "docker"] {
         let more = format!(", engine: {engine}");
         let file = operator.manifest("diamond.yaml", &spread(rig, "diamond", &hosts(rig, &more)));
-        operator.ok(&["up", &file, "--set", "run=5 s", "--trace"]);
+        operator.ok(&["up", &file, "--set", "run=15 s", "--trace"]);
         rig.hosts()[1].exec(&["pkill", "-KILL", "-f", "[i]ctusd daemon"]);
         let parts = operator.parts(&file);
         assert!(
