@@ -274,7 +274,10 @@ fn the_diamond_runs_as_processes_over_three_hosts(rig: &Rig) {
     operator.ok(&["plan", &file, "--set", "run=1 h"]);
     // Another parameter: everybody restarts at a planned stop, and no program is sent.
     let changed = operator.ok(&["up", &file, "--set", "run=3 s", "--trace"]);
-    assert!(changed.contains("restart together at a planned stop"), "{changed}");
+    assert!(
+        changed.contains("restart together at a planned stop"),
+        "{changed}"
+    );
     assert!(changed.contains("0 B sent"), "{changed}");
     tell("changed", &changed);
     verify(&operator, &file, "diamond", "diamond");
@@ -287,7 +290,10 @@ fn the_diamond_runs_as_processes_over_three_hosts(rig: &Rig) {
 /// The figures of a start.
 #[expect(clippy::print_stdout, reason = "a test's report")]
 fn tell(what: &str, up: &str) {
-    for line in up.lines().filter(|line| line.starts_with("sent ") || line.starts_with("healthy ")) {
+    for line in up
+        .lines()
+        .filter(|line| line.starts_with("sent ") || line.starts_with("healthy "))
+    {
         println!("  {what}: {line}");
     }
 }
