@@ -5,6 +5,7 @@ use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
+use ictus_deploy::{Engine, FederateRun};
 use tokio::sync::{broadcast, watch};
 use tokio::time::Instant;
 
@@ -462,8 +463,35 @@ fn validate(name: &str, request: &StartRequest) -> Result<(), ApiError> {
         if run.id != id || !store::is_name(&run.name) || run.name == RTI {
             return Err(bad(format!("`{}` cannot be a federate's name", run.name)));
         }
+        if let Some(what) = not_given(request, run) {
+            let message = format!("federate `{}` needs {what}; leave it out", run.name);
+            return Err(bad(message));
+        }
     }
     Ok(())
+}
+
+/// What a federate needs and this version does not give it; better said than left out.
+fn not_given(request: &StartRequest, run: &FederateRun) -> Option<&'static str> {
+    let part = request.part.as_ref();
+    let contained = part.is_some_and(|part| part.engine == Engine::Docker);
+    let elsewhere = part.is_some_and(|part| !part.federates.contains(&run.id));
+    let needs = &run.needs;
+    if elsewhere {
+        None
+    } else if !needs.secrets.is_empty() {
+        Some("secrets, which this version does not hand over")
+    } else if needs.realtime.is_some() {
+        Some("realtime scheduling, which this version does not set")
+    } else if !contained && !needs.cpus.is_empty() {
+        Some(
+            "processors of its own, which this version gives only to containers (`engine: docker`)",
+        )
+    } else if !contained && needs.user.is_some() {
+        Some("another user, which this version gives only to containers (`engine: docker`)")
+    } else {
+        None
+    }
 }
 
 fn begin_error(error: &BeginError) -> ApiError {
