@@ -26,25 +26,12 @@ pub fn root() -> PathBuf {
         .to_owned()
 }
 
-/// The release binary that `.ci/test` builds first: `target/release/ictus` beside the test's `target/debug/deps`.
+/// The static binary that `.ci/static` builds, which also runs on other hosts of this processor; static programs are beside
+/// it. In `target/TRIPLE/release`, beside the test's `target/debug/deps`.
 #[must_use]
 pub fn ictus() -> PathBuf {
     let test = std::env::current_exe().unwrap();
     let target = test.ancestors().nth(3).unwrap();
-    let binary = target.join("release/ictus");
-    assert!(
-        binary.exists(),
-        "{} is missing: `cargo build --release --workspace --bins` first, as make test does",
-        binary.display()
-    );
-    binary
-}
-
-/// The static binary that `.ci/static` builds, which runs on any host of this processor; static programs are beside it.
-#[must_use]
-pub fn static_ictus() -> PathBuf {
-    let target = ictus();
-    let target = target.ancestors().nth(2).unwrap();
     let triple = format!("{}-unknown-linux-gnu", std::env::consts::ARCH);
     let binary = target.join(triple).join("release/ictus");
     assert!(

@@ -13,7 +13,7 @@ use std::process::{Command, Output, Stdio};
 
 use ictus_deploy::trace::{TraceSet, Verdict, compare};
 use ictus_tests::rig::{Host, Rig};
-use ictus_tests::{root, said, static_ictus};
+use ictus_tests::{ictus, root, said};
 use serde_json::Value;
 use tempfile::TempDir;
 
@@ -92,7 +92,7 @@ impl<'r> Operator<'r> {
     fn run(&self, args: &[&str]) -> Output {
         Command::new("timeout")
             .args(["--kill-after=5", BOUND_S])
-            .arg(static_ictus())
+            .arg(ictus())
             .args(args)
             .current_dir(root())
             .env("HOME", self.home.path())
@@ -214,7 +214,7 @@ fn in_one_process(rig: &Rig, name: &str, program: &Path, into: &Path) {
 
 /// The static program of an example.
 fn program(name: &str) -> PathBuf {
-    static_ictus().with_file_name(name)
+    ictus().with_file_name(name)
 }
 
 /// Runs to the end of its time-out, and compares what the hosts wrote with one process.
