@@ -55,9 +55,10 @@ impl Sshd {
             dir.path().join("authorized_keys"),
         )
         .unwrap();
+        // A home of its own: what the user's shell runs at login is slow and not ours.
         let mut config = format!(
             "AuthorizedKeysFile {0}/authorized_keys\nStrictModes no\nUsePAM no\nPermitRootLogin prohibit-password\n\
-             PasswordAuthentication no\nKbdInteractiveAuthentication no\nPidFile none\nPrintMotd no\nPrintLastLog no\nLogLevel INFO\n{more}\n",
+             PasswordAuthentication no\nKbdInteractiveAuthentication no\nPidFile none\nPrintMotd no\nPrintLastLog no\nLogLevel INFO\nSetEnv HOME={0}\n{more}\n",
             dir.path().display()
         );
         for kind in host_keys {
