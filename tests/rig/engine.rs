@@ -106,7 +106,7 @@ fn covers(route: &str, address: Ipv4Addr) -> bool {
     };
     let shift = 32_u32.saturating_sub(length);
     let kept = |address: Ipv4Addr| address.to_bits().checked_shr(shift);
-    kept(network) == kept(address)
+    length > 0 && kept(network) == kept(address)
 }
 
 /// Whether the machine has cgroup v1, where test hosts share its tree.
