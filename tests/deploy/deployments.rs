@@ -271,7 +271,6 @@ fn the_diamond_runs_as_processes_over_three_hosts(rig: &Rig) {
     // While it runs there is nothing to do.
     let again = operator.ok(&["up", &file, "--set", "run=1 h", "--trace"]);
     assert!(again.contains("already running"), "{again}");
-    operator.ok(&["plan", &file, "--set", "run=1 h"]);
     // Another parameter: everybody restarts at a planned stop, and no program is sent.
     let changed = operator.ok(&["up", &file, "--set", "run=3 s", "--trace"]);
     assert!(
