@@ -399,15 +399,29 @@ fn a_federate_that_exits_at_once_undoes_all_hosts(rig: &Rig) {
     let canary = root().join("tests/canary");
     let text = format!(
         "ictus: v1\nfederation: faulty\n{}programs:\n  canary: {{ package: {} }}\nfederates:\n  \
-         faulty: {{ host: h2, class: Faulty, parameters: {{ at: 0 ms }} }}\n  watcher: {{ host: h1, class: Watcher }}\n\
+         faulty: {{ host: h2, class: Faulty, parameters: {{ at: 1 }} }}\n  watcher: {{ host: h1, class: Watcher }}\n\
          ",
         hosts(rig, ""),
         canary.display()
     );
     let file = operator.manifest("faulty.yaml", &text);
-    let said = operator.run(&["up", &file]);
-    let text = ictus_tests::said(&said);
-    assert!(text.contains("faulty"), "{text}");
+    let said = operator.fails(&["up", &file], 1);
+    for words in [
+        "host `h2`",
+        "tick 1 was the last straw",
+        "everything was stopped",
+    ] {
+        assert!(said.contains(words), "{words} is missing in {said}");
+    }
+    for host in rig.hosts() {
+        let found = host.output(&["pgrep", "-f", "[-]-federate"]);
+        assert_eq!(
+            found.status.code(),
+            Some(1),
+            "{}",
+            ictus_tests::said(&found)
+        );
+    }
     operator.ok(&["down", &file, "--purge"]);
     operator.leave();
 }
