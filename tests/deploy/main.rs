@@ -5,6 +5,7 @@
 
 mod deployments;
 mod hosts;
+mod operator;
 
 use ictus_tests::rig::{self, Rig, Snapshot};
 use std::panic::{AssertUnwindSafe, catch_unwind};
