@@ -7,6 +7,7 @@
 )]
 
 use std::fs;
+use std::process::Command;
 
 use ictus_tests::rig::Rig;
 use ictus_tests::{root, said};
