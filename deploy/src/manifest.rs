@@ -350,6 +350,8 @@ pub(crate) struct Defaults {
     pub(crate) stop_grace: Option<TimeSpan>,
     /// How long federates may take to join.
     pub(crate) join_timeout: Option<TimeSpan>,
+    /// How long a host may answer nothing at all before what runs there counts as lost, from 1 s to 1 h; left out, 10 s.
+    pub(crate) failure_timeout: Option<TimeSpan>,
     /// The `stp_offset` of federates that have none of their own; left out, `auto`.
     pub(crate) stp_offset: Option<OffsetText>,
     /// The `on_failure` of federates that have none of their own; left out, `stop-federation`.

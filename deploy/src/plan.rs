@@ -1,6 +1,6 @@
 //! The plan of a manifest: what every federate and the RTI are told.
 
-use ictus_coord::plan::{ClockPlan, Coordination, FORMAT, FederatePlan, Plan};
+use ictus_coord::plan::{ClockPlan, Coordination, FAILURE_TIMEOUT, FORMAT, FederatePlan, Plan};
 
 use crate::federation::{self, Member, Origin};
 use crate::manifest::{Manifest, TimeSpan, ViolationPolicy};
@@ -22,6 +22,8 @@ pub(crate) fn resolve(
         fast: manifest.fast,
         keepalive: manifest.keepalive,
         max_lead_ns: nanos(manifest.max_lead),
+        failure_timeout_ns: nanos(manifest.defaults.failure_timeout)
+            .unwrap_or(FAILURE_TIMEOUT.as_nanos()),
         clock: clock(manifest),
         extensions: true,
         wire: manifest.wire,

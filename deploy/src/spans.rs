@@ -5,6 +5,9 @@ use crate::quantity;
 /// The longest offset, and the longest term of one, in nanoseconds: an hour.
 pub(crate) const LONGEST_NS: i64 = 3_600_000_000_000;
 
+/// How long a host may be silent, in nanoseconds: kernels ask once a second at most.
+const FAILURE_NS: std::ops::RangeInclusive<i64> = 1_000_000_000..=LONGEST_NS;
+
 /// What people write for a time without end.
 const INFINITE: [&str; 5] = ["forever", "inf", "infinite", "infinity", "never"];
 
@@ -42,6 +45,10 @@ pub(crate) fn check(key: &str, text: &str, format: &str) -> Result<(), (String, 
     let error = match read {
         Ok(span) if TERMS.contains(&key) && span.as_nanos() > LONGEST_NS => {
             return Err((format!("{what} is at most 1 h: `{text}`"), fix.to_owned()));
+        }
+        Ok(span) if key == "failure_timeout" && !FAILURE_NS.contains(&span.as_nanos()) => {
+            let message = format!("`failure_timeout` is at least 1 s and at most 1 h: `{text}`");
+            return Err((message, "write it as `10 s`".to_owned()));
         }
         Ok(_) => return Ok(()),
         Err(error) => error,
@@ -124,6 +131,9 @@ after | 2 h | ictus-duration | - | -
 after | . | ictus-duration | `.` is not a number with a unit | write it as `10 ms`; units are ns, us, ms, s, min, h
 after | 1.2.3 | ictus-duration | `1.2.3` is not a number with a unit | write it as `10 ms`; units are ns, us, ms, s, min, h
 timeout | forever | ictus-duration | `timeout` is finite: `forever` | leave it out to run without end
+failure_timeout | 1 s | ictus-duration | - | -
+failure_timeout | 999 ms | ictus-duration | `failure_timeout` is at least 1 s and at most 1 h: `999 ms` | write it as `10 s`
+failure_timeout | 61 min | ictus-duration | `failure_timeout` is at least 1 s and at most 1 h: `61 min` | write it as `10 s`
 test_offset | -5 ms | ictus-signed-duration | - | -
 ";
 

@@ -181,6 +181,8 @@ fn rti_args(request: &StartRequest, federation_id: &str, prepared: Option<u16>) 
     if plan.wire == Wire::V0_13 {
         args.extend(["--wire", "0.13"]);
     }
+    let failure_timeout = (plan.failure_timeout_ns / 1_000_000).to_string();
+    args.extend(["--failure-timeout", &failure_timeout]);
     let go_on: Vec<String> = (0_u16..)
         .zip(&plan.federates)
         .filter(|(_, federate)| federate.on_failure == OnFailure::Continue)
@@ -211,6 +213,7 @@ mod tests {
         let plan = Plan {
             authentication: true,
             wire: Wire::V0_13,
+            failure_timeout_ns: 3_000_000_000,
             clock: ClockPlan {
                 sync: ClockSync::On,
                 period_ns: 5_000_000,
@@ -245,7 +248,7 @@ mod tests {
         let args = rti_args(&request, "x", None);
         assert_eq!(
             args.join(" "),
-            "rti -i x -n 2 -p 0 -c on period 5000000 exchanges-per-interval 7 -a --wire 0.13 --continue 1"
+            "rti -i x -n 2 -p 0 -c on period 5000000 exchanges-per-interval 7 -a --wire 0.13 --failure-timeout 3000 --continue 1"
         );
         let options = args.into_iter().skip(1).map(Into::into);
         assert!(matches!(Options::parse(options), Ok(Command::Run(_))));

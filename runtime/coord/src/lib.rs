@@ -11,6 +11,7 @@ mod payload;
 pub mod plan;
 pub mod report;
 pub mod rti;
+pub mod silence;
 pub mod stp;
 pub mod topology;
 pub mod wire;

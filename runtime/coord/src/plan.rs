@@ -1,10 +1,19 @@
 //! The resolved plan: everything a federate process needs to know, as JSON. Written by `ictus-deploy` from a
 //! manifest, read by every program; there is no YAML, host or image in it.
 
+use ictus_core::Duration;
 use serde::{Deserialize, Serialize};
 
 /// The format version in [`Plan::ictus`] and in [`crate::describe::ProgramDescription::ictus`].
 pub const FORMAT: &str = "v1";
+
+/// How long a host may answer nothing at all, when nobody says how long: longer than a wireless network takes to find its way
+/// again, and short for a machine that others steer.
+pub const FAILURE_TIMEOUT: Duration = Duration::from_secs(10);
+
+const fn failure_timeout_ns() -> i64 {
+    FAILURE_TIMEOUT.as_nanos()
+}
 
 /// One federation, resolved: names are checked, multiports are expanded to channels, delays are nanoseconds.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -33,6 +42,9 @@ pub struct Plan {
     /// downstream's LTC; absent: no limit. Only between our own federates under centralized coordination.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub max_lead_ns: Option<i64>,
+    /// How long a host may answer nothing at all before its federates, or the RTI, count as lost, in nanoseconds.
+    #[serde(default = "failure_timeout_ns")]
+    pub failure_timeout_ns: i64,
     /// How clocks are synchronized.
     #[serde(default)]
     pub clock: ClockPlan,
@@ -61,6 +73,7 @@ impl Default for Plan {
             fast: false,
             keepalive: false,
             max_lead_ns: None,
+            failure_timeout_ns: failure_timeout_ns(),
             clock: ClockPlan::default(),
             extensions: false,
             wire: Wire::default(),

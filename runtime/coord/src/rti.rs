@@ -184,6 +184,14 @@ pub enum Disconnect {
     /// The driver closed it to make room: [`Rti::least_needed`].
     #[error("its place was given to another")]
     Evicted,
+    /// The peer's host answers nothing any more, whatever its programs do.
+    #[error("no answer from {host} for {:.1} s", .lasting.to_std().as_secs_f64())]
+    Silent {
+        /// The host.
+        host: IpAddr,
+        /// For how long.
+        lasting: Duration,
+    },
     /// The socket failed.
     #[error("the connection failed: {0}")]
     Error(String),

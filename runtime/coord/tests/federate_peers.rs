@@ -64,15 +64,15 @@ struct World {
 
 impl World {
     fn new(plan: &Plan) -> Self {
-        Self::with(plan, None, true)
+        Self::with(plan, &|_| {}, true)
     }
 
     /// One that ends when nothing can come any more.
     fn ending(plan: &Plan) -> Self {
-        Self::with(plan, None, false)
+        Self::with(plan, &|_| {}, false)
     }
 
-    fn with(plan: &Plan, data_address: Option<[u8; 4]>, keepalive: bool) -> Self {
+    fn with(plan: &Plan, change: &dyn Fn(&mut LinkConfig), keepalive: bool) -> Self {
         let mut builder = ProgramBuilder::new();
         let me = builder.reactor("me");
         let a = builder.port(me, "a", PortKind::Input);
@@ -82,7 +82,7 @@ impl World {
         let program = Arc::new(builder.build().unwrap());
         let mut link = LinkConfig::from_plan(plan, 0, &[0, 1], &[]);
         link.federation = "test".to_owned();
-        link.data_address = data_address;
+        change(&mut link);
         let config = FederateConfig {
             keepalive,
             ..FederateConfig::default()
@@ -447,13 +447,17 @@ fn a_program_fed_by_a_physical_connection_starves_once_its_senders_are_gone() {
 
 #[test]
 fn a_cut_that_nobody_explains_ends_the_federate() {
-    let mut world = World::new(&plan("stop-federation", ""));
-    let sender = world.meets(1);
-    world.start();
-    world.federate.peer_closed(world.now, sender, false);
-    assert!(matches!(world.at(4_999), Poll::Wait(Some(_))));
-    assert_eq!(world.at(5_000), Poll::Ended);
-    assert!(matches!(world.outcome(), Outcome::PeerCut(1)));
+    // The RTI may find out later that the sender's host is gone.
+    for later in [0, 20_000] {
+        let found_later = |link: &mut LinkConfig| link.found_later = Duration::from_millis(later);
+        let mut world = World::with(&plan("stop-federation", ""), &found_later, true);
+        let sender = world.meets(1);
+        world.start();
+        world.federate.peer_closed(world.now, sender, false);
+        assert!(matches!(world.at(later + 4_999), Poll::Wait(Some(_))));
+        assert_eq!(world.at(later + 5_000), Poll::Ended);
+        assert!(matches!(world.outcome(), Outcome::PeerCut(1)));
+    }
 }
 
 #[test]
@@ -525,7 +529,7 @@ fn a_data_address_of_its_own_is_told_to_our_rti_only() {
     ] {
         let mut plan = plan("stop-federation", "");
         plan.extensions = extensions;
-        let mut world = World::with(&plan, Some([10, 1, 2, 3]), true);
+        let mut world = World::with(&plan, &|link| link.data_address = Some([10, 1, 2, 3]), true);
         let bytes = std::mem::take(world.federate.output().unwrap());
         let (mut said, mut rest) = (Vec::new(), &bytes[..]);
         while let Some((message, length)) = ToRti::decode(rest).unwrap() {

@@ -3,10 +3,12 @@
 use crate::transport::{Awaited, Connection};
 use ictus_coord::FederateExecutor;
 use ictus_coord::federate::{Federate, PeerStream};
+use ictus_coord::silence::Silent;
 use ictus_core::{Duration, PhysicalTime, Tag};
 use std::collections::BTreeSet;
 use std::io;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr, TcpListener};
+use std::os::fd::BorrowedFd;
 
 /// How long one attempt to connect may take.
 const CONNECT_MAX: Duration = Duration::from_secs(2);
@@ -26,6 +28,8 @@ pub(crate) struct Peers {
     unreachable: BTreeSet<u16>,
     /// From where others connect; empty: from everywhere.
     allow: Vec<Ipv4Addr>,
+    /// How long another host may be silent.
+    failure_timeout: Duration,
 }
 
 #[derive(Debug)]
@@ -55,10 +59,11 @@ impl Peer {
 }
 
 impl Peers {
-    /// None yet, and strangers from other addresses never; empty: from everywhere.
-    pub(crate) fn allowing(allow: Vec<Ipv4Addr>) -> Self {
+    /// None yet, and strangers from other addresses never; empty: from everywhere. Other hosts may be silent for so long.
+    pub(crate) fn allowing(allow: Vec<Ipv4Addr>, failure_timeout: Duration) -> Self {
         Self {
             allow,
+            failure_timeout,
             ..Self::default()
         }
     }
@@ -89,7 +94,8 @@ impl Peers {
         address: ([u8; 4], u16),
     ) -> Option<String> {
         let address = SocketAddr::from((Ipv4Addr::from(address.0), address.1));
-        match Connection::open(address, CONNECT_MAX) {
+        let opened = Connection::open(address, CONNECT_MAX);
+        match opened.and_then(|it| it.watch(self.failure_timeout).map(|()| it)) {
             Ok(connection) => {
                 let stream = federate.peer_connected(receiver);
                 self.connections.push(Peer::new(stream, connection, false));
@@ -129,7 +135,7 @@ impl Peers {
             let offered = connection.bytes().is_empty() || started;
             if connection.closed() && offered && !peer.told {
                 peer.told = true;
-                let cut = !connection.bytes().is_empty();
+                let cut = !connection.bytes().is_empty() || connection.lost().is_some();
                 federate.peer_closed(now, peer.stream, cut);
             }
         }
@@ -146,7 +152,9 @@ impl Peers {
                 // Not a host of the federation: it is told nothing.
                 continue;
             }
-            let Ok(connection) = Connection::of(stream, address) else {
+            let connection = Connection::of(stream, address);
+            let watched = connection.and_then(|it| it.watch(self.failure_timeout).map(|()| it));
+            let Ok(connection) = watched else {
                 continue;
             };
             let stream = federate.peer_accepted();
@@ -159,6 +167,25 @@ impl Peers {
         {
             self.connections.remove(oldest);
             strangers -= 1;
+        }
+    }
+
+    /// The sockets to and from other hosts, by number.
+    pub(crate) fn watched(&self) -> impl Iterator<Item = (usize, IpAddr, BorrowedFd<'_>)> {
+        let connections = self.connections.iter();
+        connections.filter_map(|peer| {
+            let (host, socket) = peer.connection.watched()?;
+            Some((peer.stream.index(), host, socket))
+        })
+    }
+
+    /// Nobody on this host answers any more.
+    pub(crate) fn lose(&mut self, silent: Silent) {
+        for peer in &mut self.connections {
+            let host = peer.connection.watched().map(|(host, _)| host);
+            if host == Some(silent.host) {
+                peer.connection.lose(silent);
+            }
         }
     }
 
@@ -330,7 +357,7 @@ mod tests {
     fn only_hosts_of_the_federation_connect() {
         for (allowed, taken) in [([10, 9, 8, 7], 0), ([127, 0, 0, 1], 1)] {
             let mut federate = federate(true);
-            let mut peers = Peers::allowing(vec![Ipv4Addr::from(allowed)]);
+            let mut peers = Peers::allowing(vec![Ipv4Addr::from(allowed)], Duration::from_secs(10));
             peers.listen(here(), &mut federate).unwrap();
             let address = peers.listener.as_ref().unwrap().local_addr().unwrap();
             let stranger = TcpStream::connect(address).unwrap();

@@ -14,6 +14,7 @@ use crate::outside::OutsideEvent;
 use crate::peers::Peers;
 use crate::status::Status;
 use crate::transport::{self, Awaited, Connection, Signals, Waker};
+use ictus_clock::Lookout;
 use ictus_coord::FederateExecutor as _;
 use ictus_coord::auth::Nonce;
 use ictus_coord::clock::Interval;
@@ -28,6 +29,7 @@ use std::process::ExitCode;
 use std::sync::Arc;
 
 mod error;
+mod lookout;
 mod report;
 
 pub use error::RunError;
@@ -221,6 +223,7 @@ fn run_one(job: &Job<'_>, ids: &[u16], rti: Option<SocketAddr>) -> Result<u8, Ru
         keepalive: job.plan.keepalive,
     };
     let program = Arc::clone(&assembly.program);
+    let failure_timeout = Duration::from_nanos(job.plan.failure_timeout_ns);
     let federate = match (rti, ids) {
         (Some(_), [id]) => {
             let mut link =
@@ -233,17 +236,25 @@ fn run_one(job: &Job<'_>, ids: &[u16], rti: Option<SocketAddr>) -> Result<u8, Ru
             link.authentication = job.plan.authentication.then(nonce).transpose()?;
             link.clock_port = sync.udp_port();
             link.data_address = job.args.data_address.map(|address| address.octets());
+            if job.args.data_address.is_some() {
+                // There are other hosts, and the RTI may see one vanish later than this federate does.
+                link.found_later = failure_timeout + failure_timeout;
+            }
             Federate::federated(program, config, link)
         }
         (Some(_) | None, _) => Federate::alone(program, config),
     };
     let connection = rti.map(connect).transpose()?;
+    if let Some(connection) = &connection {
+        connection.watch(failure_timeout).map_err(RunError::Io)?;
+    }
     let runner = Runner {
         io: Io {
             connection,
-            peers: Peers::allowing(job.args.allow.clone()),
+            peers: Peers::allowing(job.args.allow.clone(), failure_timeout),
             waker: Waker::new().map_err(RunError::Io)?,
             signals: Signals::new().map_err(RunError::Io)?,
+            lookout: Lookout::new(failure_timeout),
         },
         name: job.name,
         plan: job.plan,
@@ -334,6 +345,8 @@ struct Io {
     peers: Peers,
     waker: Waker,
     signals: Signals,
+    /// Whether other hosts still answer.
+    lookout: Lookout<Option<usize>>,
 }
 
 /// One federate with everything around it.
@@ -450,6 +463,7 @@ impl Runner<'_> {
 
     /// Everything that came from outside: bytes, events, signals; then what the federate wants known.
     fn look(&mut self, now: PhysicalTime) {
+        self.look_out();
         let mut drained = true;
         if let Some(connection) = &mut self.io.connection
             && !connection.closed()
@@ -499,6 +513,7 @@ impl Runner<'_> {
             .chain(self.watchdog())
             .min();
         let timeout = until.map(|until| until.since(self.clock.now()));
+        let timeout = timeout.into_iter().chain(self.io.patience()).min();
         if self.sleep(wants_write, timeout)? {
             self.take_signals()?;
         }
@@ -512,6 +527,7 @@ impl Runner<'_> {
             peers,
             waker,
             signals,
+            ..
         } = &self.io;
         let rti = connection.iter();
         let rti = rti.map(|connection| Awaited::Connection(connection, wants_write));
@@ -772,10 +788,5 @@ impl Runner<'_> {
             Some(outcome @ Outcome::Clock(_)) => (exit::CLOCK, outcome.to_string()),
             Some(outcome) => (exit::FAILED, outcome.to_string()),
         }
-    }
-
-    fn rti_name(&self) -> String {
-        let address = self.io.connection.as_ref().map(Connection::peer);
-        address.map_or_else(String::new, |address| format!(" ({address})"))
     }
 }

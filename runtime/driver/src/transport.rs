@@ -1,24 +1,19 @@
 //! Bytes to and from the RTI, and the one place where a federate waits.
 
+use ictus_clock::{ask_often, give_up, other_host};
+use ictus_coord::silence::Silent;
 use ictus_core::Duration;
 use rustix::event::{EventfdFlags, PollFd, PollFlags, Timespec, eventfd, poll};
 use rustix::io::Errno;
-use rustix::net::sockopt;
 use std::io::{self, ErrorKind, Read, Write};
-use std::net::{Shutdown, SocketAddr, TcpListener, TcpStream};
-use std::os::fd::{AsFd, OwnedFd};
+use std::net::{IpAddr, Shutdown, SocketAddr, TcpListener, TcpStream};
+use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
 use std::os::unix::net::UnixStream;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 /// One read takes at most this much, so that a federate that lags sees a batch and not one message.
 const READ_BYTES: usize = 256 << 10;
-/// Silence after which the peer's host is probed, how often, and how often in vain.
-const KEEPALIVE_AFTER: std::time::Duration = std::time::Duration::from_secs(10);
-const KEEPALIVE_EVERY: std::time::Duration = std::time::Duration::from_secs(5);
-const KEEPALIVE_PROBES: u32 = 4;
-/// Probes are not sent while data is under way; this bounds it. The kernel counts a peer that does not read, too, so it is long.
-const UNACKNOWLEDGED_MAX_MS: u32 = 120_000;
 
 /// A non-blocking connection with a buffer of bytes that are not yet whole messages.
 #[derive(Debug)]
@@ -29,6 +24,10 @@ pub(crate) struct Connection {
     taken: usize,
     closed: bool,
     peer: SocketAddr,
+    /// The peer's host, when it is another one.
+    host: Option<IpAddr>,
+    /// That host answers no more, and for how long.
+    lost: Option<Silent>,
 }
 
 impl Connection {
@@ -44,9 +43,10 @@ impl Connection {
     pub(crate) fn of(stream: TcpStream, peer: SocketAddr) -> io::Result<Self> {
         stream.set_nodelay(true)?;
         stream.set_nonblocking(true)?;
-        notice_a_dead_host(&stream)?;
         Ok(Self {
             peer,
+            host: other_host(stream.local_addr(), peer),
+            lost: None,
             stream,
             buffer: vec![0; READ_BYTES],
             filled: 0,
@@ -97,6 +97,9 @@ impl Connection {
 
     /// Writes from the front of `out` what the socket takes. A broken connection drops the rest: reading will tell.
     pub(crate) fn write(&mut self, out: &mut Vec<u8>) {
+        if self.lost.is_some() {
+            return out.clear();
+        }
         let mut written = 0;
         while written < out.len() {
             match self.stream.write(&out[written..]) {
@@ -107,6 +110,32 @@ impl Connection {
             }
         }
         out.drain(..written);
+    }
+
+    /// Has the peer's host asked often whether it is there; how long it may be silent is the [`Lookout`]'s to say.
+    pub(crate) fn watch(&self, failure_timeout: Duration) -> io::Result<()> {
+        ask_often(&self.stream, failure_timeout)
+    }
+
+    /// What is watched: the peer's host, when it is another one and not lost, and the socket.
+    pub(crate) fn watched(&self) -> Option<(IpAddr, BorrowedFd<'_>)> {
+        let here = !self.closed;
+        self.host
+            .filter(|_| here)
+            .map(|host| (host, self.stream.as_fd()))
+    }
+
+    /// The peer's host is lost: as if it had closed; what is under way is forgotten.
+    pub(crate) fn lose(&mut self, silent: Silent) {
+        self.closed = true;
+        self.lost = Some(silent);
+        // A socket that cannot be told takes longer to go.
+        let _told = give_up(&self.stream);
+    }
+
+    /// For how long the peer's host had been silent when it was lost.
+    pub(crate) fn lost(&self) -> Option<Silent> {
+        self.lost
     }
 
     /// The address at this end.
@@ -124,18 +153,6 @@ impl Connection {
         // A peer that is gone already is as finished as can be.
         drop(self.stream.shutdown(Shutdown::Write));
     }
-}
-
-/// A host that vanishes sends nothing: silence is probed, and data that stays unacknowledged ends the connection.
-fn notice_a_dead_host(stream: &TcpStream) -> io::Result<()> {
-    sockopt::set_socket_keepalive(stream, true)?;
-    sockopt::set_tcp_keepidle(stream, KEEPALIVE_AFTER)?;
-    sockopt::set_tcp_keepintvl(stream, KEEPALIVE_EVERY)?;
-    sockopt::set_tcp_keepcnt(stream, KEEPALIVE_PROBES)?;
-    Ok(sockopt::set_tcp_user_timeout(
-        stream,
-        UNACKNOWLEDGED_MAX_MS,
-    )?)
 }
 
 /// Wakes a waiting federate from another thread.

@@ -4,7 +4,7 @@ use std::ffi::OsString;
 use std::net::{IpAddr, Ipv4Addr};
 
 use ictus_clock::Stamps;
-use ictus_coord::plan::Wire;
+use ictus_coord::plan::{FAILURE_TIMEOUT, Wire};
 use ictus_coord::rti::RtiConfig;
 use ictus_core::Duration;
 
@@ -45,6 +45,8 @@ Coordinates one federation; takes the options of Lingua Franca's RTI.
   -m, --start-time-multiple VALUE UNIT
                                 round the start time up to a multiple; units from ns to weeks
       --continue ID[,ID]...     go on when one of these federates is lost: as if it had resigned
+      --failure-timeout MS      how long another host may answer nothing at all before its federates count
+                                as lost, in milliseconds from 1000 to 3600000 (default 10000)
       --max-payload SIZE        the longest payload of one message, in bytes or with K, M or G
                                 (default 64M); a longer one fails its sender; Ictus programs
                                 themselves take no longer ones than 64M
@@ -75,6 +77,8 @@ pub struct Options {
     pub allow: Vec<Ipv4Addr>,
     /// Whether nobody chose that address.
     pub bind_is_default: bool,
+    /// How long another host may answer nothing at all.
+    pub failure_timeout: Duration,
     /// The TCP port to listen on; 0: the system chooses one.
     pub port: u16,
     /// The UDP port from which clocks are compared; 0: the system chooses one.
@@ -131,6 +135,7 @@ impl Options {
             bind: IpAddr::V4(Ipv4Addr::LOCALHOST),
             allow: Vec::new(),
             bind_is_default: true,
+            failure_timeout: FAILURE_TIMEOUT,
             port: 0,
             clock_port: 0,
             stamps: Stamps::Kernel,
@@ -210,6 +215,13 @@ impl Parser {
             "-d" | "--dnet_disabled" => self.options.config.dnet = false,
             "-m" | "--start-time-multiple" => {
                 self.options.config.start_multiple = Some(self.multiple(option)?);
+            }
+            "--failure-timeout" => {
+                let expected = "milliseconds from 1000 (1 s) to 3600000 (an hour)";
+                self.options.failure_timeout = match self.number(option, expected)? {
+                    ms @ 1_000..=3_600_000 => Duration::from_millis(ms),
+                    ms => return invalid(option, expected, ms.to_string()),
+                };
             }
             "--max-payload" => {
                 let size = self.size(option, u64::from(LONGEST_PAYLOAD))?;
@@ -507,6 +519,14 @@ mod tests {
     }
 
     #[test]
+    fn hosts_may_be_silent_for_so_long() {
+        let timeout = |line: &str| parse(line).unwrap().failure_timeout;
+        assert_eq!(timeout("-n 1"), FAILURE_TIMEOUT);
+        let line = "-n 1 --failure-timeout 3000";
+        assert_eq!(timeout(line), Duration::from_secs(3));
+    }
+
+    #[test]
     fn limits_are_sizes() {
         let sizes = |line: &str| {
             let config = parse(line).unwrap().config;
@@ -545,6 +565,10 @@ mod tests {
             (
                 "-n 1 -c on period 5",
                 "`period` takes nanoseconds, from 100000 (100 us) to 60000000000 (a minute), not `5`",
+            ),
+            (
+                "-n 1 --failure-timeout 999",
+                "`--failure-timeout` takes milliseconds from 1000 (1 s) to 3600000 (an hour), not `999`",
             ),
             (
                 "-n 1 -nt 2",

@@ -2,16 +2,16 @@
 
 use std::io::{self, Read};
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
+use std::os::fd::BorrowedFd;
 use std::time::Duration;
 
-use ictus_clock::HostClock;
+use ictus_clock::{HostClock, Lookout, ask_often, give_up};
 use ictus_coord::auth::Nonce;
 use ictus_coord::rti::{ConnectionId, Disconnect, Newcomer, Rti, RtiEvent};
 use ictus_core::PhysicalTime;
 use mio::net::{TcpListener, UnixStream};
 use mio::{Events, Interest, Poll, Token};
 use rustix::io::Errno;
-use rustix::net::sockopt;
 use signal_hook::consts::{SIGINT, SIGTERM};
 
 use crate::options::Options;
@@ -50,6 +50,9 @@ pub struct Server {
     status: Status,
     /// From where connections are taken; empty: from everywhere.
     allow: Vec<Ipv4Addr>,
+    /// Whether other hosts still answer.
+    lookout: Lookout<usize>,
+    failure_timeout: ictus_core::Duration,
     buffer: Vec<u8>,
     port: u16,
     /// Nobody chose the address: only this host's federates can join.
@@ -144,6 +147,8 @@ impl Server {
             buffer: vec![0; 2 * READ],
             port,
             allow: options.allow.clone(),
+            lookout: Lookout::new(options.failure_timeout),
+            failure_timeout: options.failure_timeout,
             bind_is_default: options.bind_is_default,
         })
     }
@@ -194,6 +199,7 @@ impl Server {
             }
             self.read_round();
             let now = self.clock.now();
+            self.look_out(now);
             if self
                 .rti
                 .poll_timeout()
@@ -225,9 +231,33 @@ impl Server {
             .rti
             .poll_timeout()
             .map(|deadline| deadline.since(self.clock.now()).to_std() + Duration::from_millis(1));
-        match (again, deadline) {
-            (Some(a), Some(b)) => Some(a.min(b)),
-            (a, b) => a.or(b),
+        let lookout = self.watched().next().map(|_| self.lookout.patience());
+        let lookout = lookout.map(|it| it.to_std() + Duration::from_millis(1));
+        again.into_iter().chain(deadline).chain(lookout).min()
+    }
+
+    /// The connections with other hosts.
+    fn watched(&self) -> impl Iterator<Item = (usize, IpAddr, BorrowedFd<'_>)> {
+        watched(&self.sockets)
+    }
+
+    /// From time to time: whether other hosts still answer, whatever their programs do.
+    fn look_out(&mut self, now: PhysicalTime) {
+        for silent in self.lookout.look(watched(&self.sockets)) {
+            let lost: Vec<usize> = self
+                .watched()
+                .filter(|(_, host, _)| *host == silent.host)
+                .map(|(index, ..)| index)
+                .collect();
+            let (host, lasting) = (silent.host, silent.lasting);
+            for index in lost {
+                if let Some(socket) = &self.sockets[index] {
+                    // A socket that cannot be told takes longer to go.
+                    let _told = socket.watched().map(|(_, socket)| give_up(&socket));
+                }
+                let why = Disconnect::Silent { host, lasting };
+                self.remove(ConnectionId::from_index(index), now, &why);
+            }
         }
     }
 
@@ -344,7 +374,7 @@ impl Server {
         let id = self.rti.connect(now, newcomer);
         let interest = Interest::READABLE | Interest::WRITABLE;
         let ready = nonce.and_then(|_| stream.set_nodelay(true)).and_then(|()| {
-            keep_alive(&stream)?;
+            ask_often(&stream, self.failure_timeout)?;
             self.poll
                 .registry()
                 .register(&mut stream, Token(id.index()), interest)
@@ -357,7 +387,7 @@ impl Server {
         if self.sockets.len() <= id.index() {
             self.sockets.resize_with(id.index() + 1, || None);
         }
-        self.sockets[id.index()] = Some(Socket::new(stream));
+        self.sockets[id.index()] = Some(Socket::new(stream, peer));
     }
 
     /// One read from every socket that may have something.
@@ -432,6 +462,15 @@ impl Server {
     }
 }
 
+/// The connections with other hosts among these.
+fn watched(sockets: &[Option<Socket>]) -> impl Iterator<Item = (usize, IpAddr, BorrowedFd<'_>)> {
+    let sockets = sockets.iter().enumerate();
+    sockets.filter_map(|(index, socket)| {
+        let (host, socket) = socket.as_ref()?.watched()?;
+        Some((index, host, socket))
+    })
+}
+
 /// The federation's clock: the host's as it is; while others follow it, one that nobody steps.
 fn reference(options: &Options) -> HostClock {
     if options.config.clock_exchanges == 0 {
@@ -447,25 +486,6 @@ fn open_probes(poll: &Poll, options: &Options) -> Result<Probing, BindError> {
         address: SocketAddr::new(bind, port),
         source,
     })
-}
-
-/// How long a peer's host may acknowledge nothing, or its program take nothing of what waits for it.
-const SILENCE: Duration = Duration::from_secs(120);
-
-/// Lets the system find out that a peer's host is gone: within [`SILENCE`], whether or not anything is on its way to it.
-///
-/// While data is unacknowledged no probe is sent, and the system would send it again for a quarter of an hour: the user
-/// timeout ends that, and rules over the number of probes too. It also ends the connection of a live program that takes
-/// nothing at all for that long while more waits for it than the sockets hold (Linux counts a window that stays shut), so
-/// it is not shorter.
-fn keep_alive(stream: &mio::net::TcpStream) -> io::Result<()> {
-    sockopt::set_socket_keepalive(stream, true)?;
-    sockopt::set_tcp_keepidle(stream, Duration::from_secs(15))?;
-    sockopt::set_tcp_keepintvl(stream, Duration::from_secs(5))?;
-    sockopt::set_tcp_keepcnt(stream, 3)?;
-    let silence = u32::try_from(SILENCE.as_millis()).unwrap_or(u32::MAX);
-    sockopt::set_tcp_user_timeout(stream, silence)?;
-    Ok(())
 }
 
 /// Whether an error concerns one connection, or none.
@@ -489,19 +509,4 @@ fn nonce() -> io::Result<Nonce> {
     let mut nonce = Nonce::default();
     getrandom::fill(&mut nonce)?;
     Ok(nonce)
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn a_dead_host_is_found_out_with_data_on_its_way() {
-        let listener = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
-        let stream = std::net::TcpStream::connect(listener.local_addr().unwrap()).unwrap();
-        let stream = mio::net::TcpStream::from_std(stream);
-        keep_alive(&stream).unwrap();
-        assert!(sockopt::socket_keepalive(&stream).unwrap());
-        assert_eq!(sockopt::tcp_user_timeout(&stream).unwrap(), 120_000);
-    }
 }

@@ -1,9 +1,10 @@
 //! One connection: bytes in to the state machine, bytes out of its output.
 
 use std::io::{ErrorKind, Read, Write};
-use std::net::Shutdown;
+use std::net::{IpAddr, Shutdown, SocketAddr};
+use std::os::fd::{AsFd, BorrowedFd};
 
-use ictus_clock::HostClock;
+use ictus_clock::{HostClock, other_host};
 use ictus_coord::rti::{Closing, ConnectionId, Disconnect, Output, Rti};
 use mio::net::TcpStream;
 
@@ -18,6 +19,8 @@ const FAREWELL: usize = 4 << 20;
 #[derive(Debug)]
 pub(crate) struct Socket {
     stream: TcpStream,
+    /// The peer's host, when it is another one.
+    host: Option<IpAddr>,
     leftover: Vec<u8>,
     /// More may be read without waiting for an event.
     pub(crate) readable: bool,
@@ -57,8 +60,9 @@ pub(crate) enum Flushed {
 }
 
 impl Socket {
-    pub(crate) const fn new(stream: TcpStream) -> Self {
+    pub(crate) fn new(stream: TcpStream, peer: SocketAddr) -> Self {
         Self {
+            host: other_host(stream.local_addr(), peer),
             stream,
             leftover: Vec::new(),
             readable: true,
@@ -67,6 +71,11 @@ impl Socket {
             leaving: false,
             farewell: 0,
         }
+    }
+
+    /// What is watched: the peer's host, when it is another one, and the socket.
+    pub(crate) fn watched(&self) -> Option<(IpAddr, BorrowedFd<'_>)> {
+        self.host.map(|host| (host, self.stream.as_fd()))
     }
 
     pub(crate) const fn stream_mut(&mut self) -> &mut TcpStream {

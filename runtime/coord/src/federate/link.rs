@@ -65,6 +65,8 @@ pub struct LinkConfig {
     pub max_stp_violations: Option<u64>,
     /// The federates that a federate's loss concerns: those that it reaches over other federates.
     pub indirect_upstream: Vec<u16>,
+    /// How much later than this federate the RTI may find out that a host is gone.
+    pub found_later: Duration,
     /// Rules that are wrong; none but in tests.
     #[doc(hidden)]
     pub mutants: Mutants,
@@ -131,6 +133,7 @@ impl LinkConfig {
             stp_offset: Duration::from_nanos(plan.federates[usize::from(id)].stp_offset_ns),
             max_stp_violations: plan.federates[usize::from(id)].max_stp_violations,
             indirect_upstream,
+            found_later: Duration::ZERO,
             mutants: Mutants::NONE,
         }
     }

@@ -401,7 +401,8 @@ impl Federate {
         }
         // The RTI may have said so already.
         if lost && !self.stop.has_lost(peer) {
-            let until = now.saturating_add(super::LOSS_EXPLAINED_WITHIN);
+            let within = super::LOSS_EXPLAINED_WITHIN + link.config.found_later;
+            let until = now.saturating_add(within);
             self.unexplained.get_or_insert((peer, until));
         }
     }
