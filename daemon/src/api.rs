@@ -6,7 +6,7 @@
 //! | `GET /v1/federations`, `GET /v1/federations/NAME` | [`FederationView`], a list of them |
 //! | `POST /v1/federations/NAME` with a [`StartRequest`] | a stream of [`Happening`], one a line, until the federation ends; closing it before `healthy` undoes the start |
 //! | `POST /v1/federations/NAME/stop?kill=BOOL` | the same stream until the end |
-//! | `DELETE /v1/federations/NAME?purge=BOOL` | [`Removed`], when nothing runs any more |
+//! | `DELETE /v1/federations/NAME?purge=BOOL&keep_history=BOOL` | [`Removed`], when nothing runs any more |
 //! | `GET /v1/federations/NAME/measures` | [`FederationMeasures`], until it is taken down |
 //! | `GET /v1/federations/NAME/logs?follow=BOOL&federate=A,B&tail=N` | a stream of [`LogLine`] |
 //! | `GET /v1/events?follow=BOOL&federation=NAME` | a stream of [`Happening`] |
@@ -29,8 +29,10 @@ use serde::{Deserialize, Serialize};
 use crate::supervisor::exit::Ending;
 
 pub mod part;
+pub mod recorded;
 
 use part::Part;
+use recorded::Kept;
 
 /// The version in every path.
 pub const VERSION: &str = "v1";
@@ -108,6 +110,9 @@ pub struct FederationView {
     /// The digest of each thing that matters, by what it is.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     pub facets: BTreeMap<String, String>,
+    /// The number that was proposed for this run in the federation's history.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub generation: Option<u64>,
 }
 
 /// Where a federation stands in its life.
@@ -446,7 +451,7 @@ pub struct Removed {
     /// How the run ended, if one was stopped for it or had ended before.
     pub outcome: Option<Outcome>,
     /// What is left on disk.
-    pub kept: Vec<PathBuf>,
+    pub kept: Vec<Kept>,
 }
 
 /// A line of a log.

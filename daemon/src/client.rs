@@ -106,6 +106,9 @@ pub enum ClientError {
     /// The daemon said something that this version does not understand.
     #[error("the daemon's answer is not understood; is it of another version?")]
     NotUnderstood(#[source] serde_json::Error),
+    /// What came could not be written down here.
+    #[error("cannot write what was sent")]
+    Unwritable(#[source] io::Error),
     /// The daemon's answer is larger than any it should give.
     #[error("the daemon's answer is too large")]
     TooLarge,
@@ -123,6 +126,7 @@ impl ClientError {
             | Self::Silent { .. }
             | Self::Broken(_)
             | Self::NotUnderstood(_)
+            | Self::Unwritable(_)
             | Self::TooLarge => None,
         }
     }
@@ -476,6 +480,7 @@ pub fn is_already_running(error: &ClientError) -> bool {
 }
 
 mod parts;
+mod recorded;
 
 /// A stream of JSON values; dropping it closes the connection.
 #[derive(Debug)]

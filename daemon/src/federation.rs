@@ -148,6 +148,7 @@ impl Federation {
             part: request.part.clone(),
             digest: String::new(),
             facets: BTreeMap::new(),
+            generation: None,
         };
         let record = Record {
             protocol: PROTOCOL,

@@ -20,10 +20,11 @@ use crate::leases::Leases;
 use crate::metrics::{self, Snapshot};
 use crate::paths::Paths;
 use crate::scrape::Listeners;
-use crate::store::{self, Directory, Record, StoreError};
+use crate::store::{self, Directory, Leave, Record, StoreError};
 use crate::{rescue, stamp};
 
 mod parts;
+mod recorded;
 
 /// Events that a slow follower may miss before it is disconnected.
 const EVENTS_MAX: usize = 4096;
@@ -230,7 +231,7 @@ impl Host {
     pub(crate) async fn remove(
         &self,
         name: &str,
-        (purge, fence): (bool, Option<u64>),
+        (leave, fence): (Leave, Option<u64>),
     ) -> Result<Removed, ApiError> {
         self.check_fence(name, fence)?;
         self.check_known(name)?;
@@ -244,11 +245,12 @@ impl Host {
         self.check_driven(name)?;
         self.listeners().release(name);
         self.remove_containers(name, Images::Remove).await?;
+        self.settle(name);
         let kept = self
             .directory(name)
-            .remove(purge)
+            .remove(leave)
             .map_err(|error| store_error(&error))?;
-        if purge {
+        if leave != Leave::Logs {
             // Only when it was the last one.
             std::fs::remove_dir(self.0.paths.federations()).ok();
         }
@@ -296,6 +298,7 @@ impl Host {
             federation.run().await;
             // No await in between: who saw the end can start the same name again.
             host.living().remove(&name);
+            host.settle(&name);
             host.touch();
         });
     }
@@ -439,6 +442,7 @@ fn unreadable_view(name: &str, directory: &Directory, error: &StoreError) -> Fed
         part: None,
         digest: String::new(),
         facets: BTreeMap::new(),
+        generation: None,
     }
 }
 

@@ -14,6 +14,7 @@ mod docker;
 mod facts;
 mod federation;
 mod files;
+mod history;
 mod host;
 pub mod identity;
 mod leases;

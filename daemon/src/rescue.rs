@@ -60,6 +60,7 @@ pub(crate) fn record(name: &str, directory: &Directory) -> Option<Record> {
         part: None,
         digest: String::new(),
         facets: BTreeMap::new(),
+        generation: None,
     };
     for happening in events {
         let by_user = |by: &str| by == "user" && view.state == State::Running;

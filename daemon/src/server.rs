@@ -26,8 +26,10 @@ use crate::api::{
 use crate::federation::Command;
 use crate::host::Host;
 use crate::logs::Follower;
+use crate::store::Leave;
 
 mod parts;
+mod recorded;
 
 /// Lines of a stream that wait for a slow client.
 const LINES_MAX: usize = 1024;
@@ -59,6 +61,8 @@ pub(crate) fn router(host: Host) -> Router {
         .route("/v1/give-way", post(give_way))
         .route("/metrics", get(metrics))
         .merge(parts::router())
+        .merge(recorded::readable())
+        .merge(recorded::private())
         .fallback(async || bad_request("no such call; is the daemon of another version?"))
         .layer(from_fn_with_state(host.clone(), touch))
         .layer(DefaultBodyLimit::max(REQUEST_BYTES_MAX))
@@ -190,6 +194,9 @@ async fn stop(
 struct RemoveQuery {
     #[serde(default)]
     purge: bool,
+    /// With `purge`: the generations before stay.
+    #[serde(default)]
+    keep_history: bool,
     fence: Option<u64>,
 }
 
@@ -199,7 +206,12 @@ async fn remove(
     Query(query): Query<RemoveQuery>,
 ) -> Result<Json<Removed>, ApiError> {
     // In a task: a client that goes away does not leave half a removal.
-    let removal = tokio::spawn(async move { host.remove(&name, (query.purge, query.fence)).await });
+    let leave = match (query.purge, query.keep_history) {
+        (false, _) => Leave::Logs,
+        (true, true) => Leave::History,
+        (true, false) => Leave::Nothing,
+    };
+    let removal = tokio::spawn(async move { host.remove(&name, (leave, query.fence)).await });
     removal
         .await
         .unwrap_or_else(|error| {

@@ -7,8 +7,11 @@ use std::net::SocketAddrV4;
 use std::os::unix::fs::DirBuilderExt;
 use std::path::{Path, PathBuf};
 
+use ictus_coord::plan::Plan;
+use ictus_deploy::TimingSpec;
 use serde::{Deserialize, Serialize};
 
+use crate::api::recorded::Kept;
 use crate::api::{FederationMeasures, FederationView, Happening, StartRequest};
 use crate::files;
 use crate::identity::ProcessIdentity;
@@ -49,6 +52,17 @@ pub struct Supervised {
     pub container: Option<String>,
     /// The process as this host sees it, once it has answered.
     pub supervisor: Option<ProcessIdentity>,
+}
+
+/// What stays of a run that is removed.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Leave {
+    /// What a person may want to read, and the generations.
+    Logs,
+    /// The generations only.
+    History,
+    /// Nothing.
+    Nothing,
 }
 
 /// Why a stored run cannot be read.
@@ -165,6 +179,11 @@ impl Directory {
         self.0.join("work")
     }
 
+    /// The generations: runs that were committed here.
+    pub(crate) fn history(&self) -> PathBuf {
+        self.0.join("history")
+    }
+
     fn request(&self) -> PathBuf {
         self.0.join("request.json")
     }
@@ -186,7 +205,7 @@ impl Directory {
     /// # Errors
     /// When the disk does not take it.
     pub fn prepare(&self, request: &StartRequest) -> Result<(), StoreError> {
-        files::remove(&self.0).map_err(io_at(&self.0))?;
+        self.clear()?;
         let exit = self.0.join("exit");
         for directory in [
             self.logs(),
@@ -206,6 +225,28 @@ impl Directory {
         write(&self.plan(), &request.plan)?;
         write(&self.timing_spec(), &request.timing)?;
         write(&self.request(), request)
+    }
+
+    /// Reads the plan, and what `ictus timing` is to print; they stay when a run is taken down.
+    ///
+    /// # Errors
+    /// When one cannot be read.
+    pub fn read_plan(&self) -> Result<(Plan, TimingSpec), StoreError> {
+        Ok((read(&self.plan())?, read(&self.timing_spec())?))
+    }
+
+    /// Removes all but the generations, and the directory when there are none.
+    fn clear(&self) -> Result<(), StoreError> {
+        let entries = fs::read_dir(&self.0).into_iter().flatten().flatten();
+        for path in entries.map(|entry| entry.path()) {
+            if path != self.history() {
+                files::remove(&path).map_err(io_at(&path))?;
+            }
+        }
+        // Fails when something is in it.
+        fs::remove_dir(self.history()).ok();
+        fs::remove_dir(&self.0).ok();
+        Ok(())
     }
 
     /// Reads what the run was started from.
@@ -284,28 +325,35 @@ impl Directory {
             .collect()
     }
 
-    /// Removes all but what a person may want to read after the end (logs, traces, timing files, plan, events,
-    /// exit records), or with `purge` everything; gives the directories of logs, traces and timing files that
-    /// are left, and removes those with nothing in them.
+    /// Removes all but what is to stay; after [`Leave::Logs`] that is what a person may want to read after the end (logs,
+    /// traces, timing files, plan, events, exit records) and the generations. Gives the directories that are left, and
+    /// removes those with nothing in them.
     ///
     /// # Errors
     /// When something cannot be removed.
-    pub fn remove(&self, purge: bool) -> Result<Vec<PathBuf>, StoreError> {
-        if purge {
-            files::remove(&self.0).map_err(io_at(&self.0))?;
-            return Ok(Vec::new());
+    pub fn remove(&self, leave: Leave) -> Result<Vec<Kept>, StoreError> {
+        match leave {
+            Leave::Logs => {}
+            Leave::History => {
+                self.clear()?;
+                return Ok(kept(self.history()).into_iter().collect());
+            }
+            Leave::Nothing => {
+                files::remove(&self.0).map_err(io_at(&self.0))?;
+                return Ok(Vec::new());
+            }
         }
         for path in [self.request(), self.record(), self.measures(), self.specs()] {
             files::remove(&path).map_err(io_at(&path))?;
         }
-        let mut kept = Vec::new();
-        for path in [self.logs(), self.trace(), self.timing(), self.work()] {
-            // Succeeds when nothing is in it.
-            if fs::remove_dir(&path).is_err() && path.exists() {
-                kept.push(path);
-            }
-        }
-        Ok(kept)
+        let left = [
+            self.logs(),
+            self.trace(),
+            self.timing(),
+            self.work(),
+            self.history(),
+        ];
+        Ok(left.into_iter().filter_map(kept).collect())
     }
 
     /// Removes what a start that was undone needs no more: logs, events, record and exit records stay.
@@ -327,6 +375,26 @@ impl Directory {
         }
         Ok(())
     }
+}
+
+/// What is left of a directory, which goes when nothing is in it.
+fn kept(path: PathBuf) -> Option<Kept> {
+    // Succeeds when nothing is in it.
+    (fs::remove_dir(&path).is_err() && path.exists()).then(|| Kept {
+        bytes: bytes_below(&path),
+        path,
+    })
+}
+
+/// Bytes of all files below a directory; links are not followed.
+fn bytes_below(directory: &Path) -> u64 {
+    let entries = fs::read_dir(directory).into_iter().flatten().flatten();
+    let bytes = entries.map(|entry| match entry.metadata() {
+        Ok(found) if found.is_dir() => bytes_below(&entry.path()),
+        Ok(found) => found.len(),
+        Err(_) => 0,
+    });
+    bytes.sum()
 }
 
 fn write(path: &Path, value: &impl Serialize) -> Result<(), StoreError> {

@@ -26,6 +26,6 @@ pub use apply::{Apply, Moment, Outcome, Phase};
 pub use desired::{Blob, Desired, DesiredError, DesiredHost, ProgramFile};
 pub use observed::{Held, MemberState, NewerRecord, Observed, Reached, Run, RunState};
 pub use outcome::{Cause, Ended, Merged, PartOutcome, merge_outcomes};
-pub use plan::{Part, Plan, Stale, plan, plan_down};
+pub use plan::{Part, Plan, Stale, plan, plan_down, plan_stop};
 pub use refusal::{Reason, Refusal};
 pub use step::{Operation, Step, StepId};

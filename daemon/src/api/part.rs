@@ -66,6 +66,9 @@ pub struct PrepareRequest {
     /// The digest of each thing that matters, by what it is, by which a later `up` says what has changed.
     #[serde(default)]
     pub facets: BTreeMap<String, String>,
+    /// The number of this run in the federation's history; absent: the next one here.
+    #[serde(default)]
+    pub generation: Option<u64>,
     /// What to run; has a part.
     pub request: StartRequest,
 }

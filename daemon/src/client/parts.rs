@@ -183,6 +183,21 @@ impl Client {
         let path = path(name, "", &[("purge", &purge), ("fence", &fence)]);
         self.answer(Method::DELETE, &path, Bytes::new()).await
     }
+
+    /// The same for a part that was not begun: the generations before it stay.
+    ///
+    /// # Errors
+    /// See [`ClientError`].
+    pub async fn undo_part(&self, (name, fence): (&str, u64)) -> Result<Removed, ClientError> {
+        let fence = fence.to_string();
+        let query = [
+            ("purge", "true"),
+            ("keep_history", "true"),
+            ("fence", &fence),
+        ];
+        self.answer(Method::DELETE, &path(name, "", &query), Bytes::new())
+            .await
+    }
 }
 
 fn json(value: &impl serde::Serialize) -> Result<Bytes, ClientError> {

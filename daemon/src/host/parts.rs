@@ -1,6 +1,5 @@
 //! A host's part of a federation over several hosts: leases, blobs, prepare, commit.
 
-use std::collections::BTreeSet;
 use std::io::Read;
 use std::net::{Ipv4Addr, SocketAddrV4, TcpListener};
 
@@ -96,15 +95,7 @@ impl Host {
         if !self.lease_views().is_empty() {
             return;
         }
-        let requests = self.names();
-        let requests = requests
-            .iter()
-            .filter_map(|name| self.directory(name).read_request().ok());
-        let needed: BTreeSet<String> = requests
-            .filter_map(|request| request.part)
-            .flat_map(|part| part.programs.into_values())
-            .collect();
-        if let Err(error) = self.blobs().keep_only(&needed) {
+        if let Err(error) = self.blobs().keep_only(&self.needed_blobs()) {
             tracing::warn!(%error, "blobs were not removed");
         }
     }
@@ -139,12 +130,14 @@ impl Host {
             .rti
             .then(|| free_port(part, request.settings.rti_port))
             .transpose()?;
+        self.settle(name);
         let id = prepare.id.clone();
         let prepared = Federation::prepare(self.paths(), name, request, id);
         let (directory, mut record) = prepared.map_err(|error| store_error(&error))?;
         record.view.rti_port = rti_port.flatten();
         record.view.digest.clone_from(&prepare.digest);
         record.view.facets.clone_from(&prepare.facets);
+        record.view.generation = prepare.generation;
         let written = directory.write_record(&record);
         written.map_err(|error| store_error(&error))?;
         Ok(Prepared {
@@ -232,6 +225,7 @@ impl Host {
             bind(part.address, port).map_err(|why| taken(part, port, &why))?;
         }
         record.view.metrics = self.listen(name, request.settings.metrics_listen)?;
+        self.enter(name, &record, &request)?;
         let told = self.0.told.clone();
         let state = (request, record, commit.rti);
         let (federation, handle) = Federation::begin(self.paths(), directory, state, told);

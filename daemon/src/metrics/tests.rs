@@ -101,6 +101,7 @@ fn snapshot(federation: &str) -> Snapshot {
             part: None,
             digest: String::new(),
             facets: BTreeMap::new(),
+            generation: None,
         },
         measures: FederationMeasures {
             federation: federation.to_owned(),

@@ -435,6 +435,7 @@ async fn images_are_made_before_anything_runs() {
         id: "run-1".to_owned(),
         digest: String::new(),
         facets: BTreeMap::new(),
+        generation: None,
         request: rig.request(&[("a", ""), ("b", "")]),
     };
     prepare.request.federates[1].needs.image = Some("no-such-image:1".to_owned());

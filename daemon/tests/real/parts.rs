@@ -49,6 +49,7 @@ fn prepare(request: StartRequest, previous: Option<&str>) -> PrepareRequest {
         id: "run-1".to_owned(),
         digest: "of all".to_owned(),
         facets: BTreeMap::new(),
+        generation: None,
         request,
     }
 }

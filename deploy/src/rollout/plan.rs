@@ -218,6 +218,31 @@ pub fn plan_down(
     Ok(plan)
 }
 
+/// What has to be done so that nothing of a federation runs on the hosts that were asked; everything else stays as it is.
+///
+/// # Errors
+/// As for [`plan_down`].
+pub fn plan_stop(
+    federation: &str,
+    observed: &BTreeMap<String, Observed>,
+    stop_limit_ms: u64,
+) -> Result<Plan, Refusal> {
+    refuse(obstacles(
+        observed.keys(),
+        observed,
+        env!("CARGO_PKG_VERSION"),
+    ))?;
+    let mut plan = Plan::new(federation, None, planned_for(observed));
+    plan.stop_limit_ms = stop_limit_ms;
+    let steps = Graph::new(observed, stop_limit_ms).halt();
+    let stops = |step: &Step| matches!(step.operation, Operation::StopOld { .. });
+    if steps.iter().any(stops) {
+        plan.causes = vec!["it is stopped".to_owned()];
+        plan.steps = steps;
+    }
+    Ok(plan)
+}
+
 impl Plan {
     fn new(
         federation: &str,
@@ -551,6 +576,13 @@ impl<'a> Graph<'a> {
             healthy.push(id);
         }
         healthy
+    }
+
+    fn halt(mut self) -> Vec<Step> {
+        let leased = self.lease();
+        let stopped = self.stop("it is stopped", &leased);
+        self.release(&stopped);
+        self.steps
     }
 
     fn down(mut self, purge: bool) -> Vec<Step> {
