@@ -14,7 +14,7 @@ use crate::error::{CliError, USAGE};
 use crate::ui::Ui;
 
 const EXIT_CODES: &str = "Exit codes: 0 done, 1 failed, 2 `plan`: there are changes, 3 the manifest has mistakes, 4 a host cannot be reached, \
-     5 somebody else is at it, 6 not in time, 8 done on some hosts only, 64 wrong usage";
+     5 somebody else is at it, 6 not in time, 8 done on some hosts only, 9 a saved plan is out of date, 64 wrong usage";
 
 /// Run federations of deterministic reactors from one manifest
 #[derive(Debug, Parser)]
@@ -64,6 +64,8 @@ enum Command {
     Stop(commands::stop::Stop),
     Down(commands::down::Down),
     Verify(commands::verify::Verify),
+    History(commands::history::History),
+    Rollback(commands::history::Rollback),
     Host(commands::host::Host),
     Lock(commands::lock::Lock),
     /// Measure throughput and latency beside the floors of this machine
@@ -149,6 +151,8 @@ fn run(cli: Cli) -> ExitCode {
         Command::Stop(it) => it.run(&mut ui),
         Command::Down(it) => it.run(&mut ui),
         Command::Verify(it) => it.run(&mut ui),
+        Command::History(it) => it.run(&mut ui),
+        Command::Rollback(it) => it.run(&mut ui),
         Command::Host(it) => it.run(&mut ui),
         Command::Lock(it) => it.run(&mut ui),
         Command::Bench(it) => commands::bench::run(&it.args),

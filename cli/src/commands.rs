@@ -7,6 +7,7 @@ pub(crate) mod dial_stdio;
 pub(crate) mod down;
 pub(crate) mod events;
 pub(crate) mod explain;
+pub(crate) mod history;
 pub(crate) mod host;
 pub(crate) mod init;
 pub(crate) mod lock;

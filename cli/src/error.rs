@@ -33,6 +33,8 @@ pub(crate) enum Kind {
     Partial,
     /// There is something to do (`plan`); nothing is wrong.
     Changes,
+    /// A saved plan was made for another state of a host or of the manifest.
+    Stale,
     /// It did not become healthy, or did not end, in time.
     Timeout,
     /// The daemon went away; what runs goes on.
@@ -74,6 +76,7 @@ impl CliError {
             Kind::Unreachable => 4,
             Kind::Held => 5,
             Kind::Partial => 8,
+            Kind::Stale => 9,
             Kind::Timeout => 6,
             Kind::BrokenPipe => 0,
         }

@@ -10,8 +10,11 @@ use ictusd::client::Client;
 use crate::error::CliError;
 use crate::session::Session;
 
+pub(crate) mod clocks;
+pub(crate) mod copied;
 mod dial;
 pub(crate) mod merge;
+pub(crate) mod outcome;
 
 pub(crate) use dial::{options, target, unreachable_host};
 
@@ -56,6 +59,23 @@ pub(crate) async fn connect(session: &Session, name: &str, way: &Way) -> Result<
             identity,
         } => dial::connect(name, target, *client, identity.as_deref()).await,
     }
+}
+
+/// The hosts of the last run that was taken down, as those that were asked remember it.
+pub(crate) async fn left(clients: &[Client], name: &str) -> BTreeMap<String, Way> {
+    for client in clients {
+        let runs = client.history(name).await.unwrap_or_default();
+        let Some(last) = runs.into_iter().find(|run| run.kept) else {
+            continue;
+        };
+        let run = client.generation(name, &last.id).await.ok();
+        let part = run.and_then(|run| run.request?.part);
+        if let Some(part) = part {
+            let hosts = part.hosts.into_iter();
+            return hosts.map(|(host, it)| (host, it.way)).collect();
+        }
+    }
+    BTreeMap::new()
 }
 
 /// The other hosts of a run, as the record on one of them tells.

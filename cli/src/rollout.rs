@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 use ictus_deploy::image::elf::Machine;
 use ictus_deploy::placement::{Placement, Way};
 use ictus_deploy::rollout::{
-    Desired, Observed, Plan, ProgramFile, Reason, Refusal, plan, plan_down,
+    Desired, Observed, Plan, ProgramFile, Reason, Refusal, plan, plan_down, plan_stop,
 };
 use ictus_deploy::{Checked, FederateRun};
 use ictusd::api::StartRequest;
@@ -19,10 +19,14 @@ use crate::error::{CliError, Kind};
 use crate::hosts::{Clients, connect_all, ways};
 use crate::session::{Session, request};
 
+mod again;
 mod execute;
 mod observe;
+mod saved;
 
+pub(crate) use again::Again;
 pub(crate) use execute::{Executor, size, who};
+pub(crate) use saved::SavedPlan;
 
 /// How long an ordered stop of a federation may take of which no manifest says more, in milliseconds.
 const STOP_LIMIT_MS: u64 = 60_000;
@@ -38,6 +42,9 @@ pub(crate) struct Rollout<'a> {
     files: BTreeMap<String, PathBuf>,
     pub(crate) clients: Clients,
     pub(crate) plan: Plan,
+    observed: ObservedHosts,
+    /// The number that this run will have in the history.
+    generation: u64,
 }
 
 impl<'a> Rollout<'a> {
@@ -63,6 +70,7 @@ impl<'a> Rollout<'a> {
         };
         let (clients, observed) = observe::all(connected, &desired.federation, &blobs).await;
         let plan = plan(&desired, &observed).map_err(refused)?;
+        let generation = next_generation(&clients, &desired.federation).await;
         Ok(Self {
             checked,
             placement,
@@ -71,7 +79,29 @@ impl<'a> Rollout<'a> {
             files,
             clients,
             plan,
+            observed,
+            generation,
         })
+    }
+
+    /// The plan with what it was made from, for a file.
+    pub(crate) fn saved(&self, set: &[(String, String)]) -> SavedPlan {
+        SavedPlan {
+            manifest: self.checked.manifest.clone(),
+            set: set.to_vec(),
+            trace: self.trace,
+            facets: self.desired.facets.clone(),
+            plan: self.plan.clone(),
+        }
+    }
+
+    /// Takes exactly the saved plan, unless a host or the manifest has moved on since it was made.
+    pub(crate) fn follow(&mut self, saved: SavedPlan) -> Result<(), CliError> {
+        let stale = saved.plan.is_for(&self.desired);
+        let stale = stale.and_then(|()| saved.plan.still_valid(&self.observed));
+        stale.map_err(|stale| saved.refused(&stale, &self.desired.facets, &self.plan.causes))?;
+        self.plan = saved.plan;
+        Ok(())
     }
 
     /// Whether everything runs as the manifest says.
@@ -139,6 +169,27 @@ impl<'a> Rollout<'a> {
         let host = self.placement.hosts.get(self.placement.rti)?;
         Some(self.address(host.address))
     }
+}
+
+/// The number of the next run: one more than any host remembers.
+async fn next_generation(clients: &Clients, federation: &str) -> u64 {
+    let asked = clients.values().map(|client| client.history(federation));
+    let answers = futures_util::future::join_all(asked).await;
+    // A host that does not know the federation remembers none.
+    let all = answers.into_iter().flatten().flatten();
+    all.map(|run| run.number).max().unwrap_or(0) + 1
+}
+
+/// What is planned to stop a federation, and on whom it is carried out.
+pub(crate) async fn stop(
+    session: &Session,
+    name: &str,
+    ways: &BTreeMap<String, Way>,
+) -> Result<(Clients, Plan), CliError> {
+    let connected = connect_all(session, ways).await;
+    let (clients, observed) = observe::all(connected, name, &|_| Vec::new()).await;
+    let plan = plan_stop(name, &observed, STOP_LIMIT_MS).map_err(refused)?;
+    Ok((clients, plan))
 }
 
 /// What is planned to take a federation down, and on whom it is carried out.

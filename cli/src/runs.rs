@@ -6,16 +6,29 @@ use std::time::Duration;
 
 use ictus_coord::plan::Plan;
 use ictus_deploy::Checked;
+use ictusd::api::recorded::FileKind;
 use ictusd::api::{Event, Happening, Outcome, StartRequest};
 use ictusd::store::Directory;
 
 use crate::error::{CliError, Kind};
+use crate::hosts::copied::Copied;
 use crate::interrupts::Interrupts;
-use crate::session::{Session, request, succeed};
+use crate::session::{Abroad, Session, request, succeed};
 use crate::ui::Ui;
+
+mod abroad;
 
 /// How much longer than its timeout a run may take: start, consensus, slow reactions.
 const SLACK: Duration = Duration::from_secs(60);
+
+/// Where a run's files are; copies of other hosts' are removed with this.
+#[derive(Debug)]
+pub(crate) struct Files {
+    pub(crate) trace: PathBuf,
+    pub(crate) timing: PathBuf,
+    /// Kept for what it removes.
+    _copied: Option<Copied>,
+}
 
 /// Runs that are removed when this is.
 #[derive(Debug)]
@@ -25,6 +38,8 @@ pub(crate) struct Runs<'a> {
     limit: Duration,
     interrupts: Interrupts,
     names: Vec<String>,
+    /// Runs over hosts.
+    abroad: Vec<Abroad>,
     /// The run that failed: its logs stay.
     failed: Option<String>,
 }
@@ -50,18 +65,19 @@ impl<'a> Runs<'a> {
             limit,
             interrupts: Interrupts::new()?,
             names: Vec::new(),
+            abroad: Vec::new(),
             failed: None,
         })
     }
 
-    /// Runs the federation once, by a plan of it; gives the directory of what it left.
-    pub(crate) async fn federated(
-        &mut self,
-        plan: &Plan,
-        trace: bool,
-    ) -> Result<Directory, CliError> {
+    /// Runs the federation once, by a plan of it, on this machine or over its hosts; gives what it left.
+    pub(crate) async fn federated(&mut self, plan: &Plan, trace: bool) -> Result<Files, CliError> {
         let own = &self.checked.plan.federation;
-        let name = format!("{own}.{}.{}", std::process::id(), self.names.len() + 1);
+        let number = self.names.len() + self.abroad.len() + 1;
+        let name = format!("{own}.{}.{number}", std::process::id());
+        if let Some(placement) = &self.checked.placement {
+            return self.over_hosts(&name, (plan, placement), trace).await;
+        }
         // Asked for anew each time: one that has owned nothing for long may have ended.
         let client = self.session.daemon().await?;
         let request = StartRequest {
@@ -88,11 +104,11 @@ impl<'a> Runs<'a> {
                 "run `{name}` was stopped from outside"
             )));
         }
-        Ok(Directory::of(&self.session.paths.federations(), &name))
+        Ok(Files::of(self.session, &name))
     }
 
-    /// Runs the whole plan in one process; gives the directory of its trace.
-    pub(crate) async fn in_one_process(&mut self) -> Result<PathBuf, CliError> {
+    /// Runs a whole plan in one process; gives the directory of its trace.
+    pub(crate) async fn in_one_process(&mut self, plan: &Plan) -> Result<PathBuf, CliError> {
         let Some(program) = &self.checked.one_program else {
             let message = "the federation cannot run in one process";
             return Err(CliError::failed(message)
@@ -106,7 +122,10 @@ impl<'a> Runs<'a> {
         self.names.push(name.clone());
         let directory = Directory::of(&self.session.paths.federations(), &name);
         directory
-            .prepare(&request(self.checked, true))
+            .prepare(&StartRequest {
+                plan: plan.clone(),
+                ..request(self.checked, true)
+            })
             .map_err(CliError::failed)?;
         let log = directory.logs().join("one.log");
         let out = std::fs::File::create(&log).map_err(CliError::failed)?;
@@ -148,6 +167,16 @@ impl<'a> Runs<'a> {
 
     /// Removes what the runs left, the logs of a failed one apart, and lets the daemon end if it has nothing else to do.
     pub(crate) async fn remove(self, ui: &mut Ui) {
+        let failed = self.failed.clone();
+        for abroad in &self.abroad {
+            let purge = failed.as_ref() != Some(&abroad.name);
+            if let Err(error) = abroad::take_down(self.session, abroad, purge).await {
+                ui.warning(&format!("run `{}` was not removed: {error}", abroad.name));
+            }
+        }
+        if self.names.is_empty() {
+            return;
+        }
         let client = match self.session.daemon().await {
             Ok(client) => client,
             Err(error) => return ui.warning(&format!("runs were not removed: {error}")),
@@ -172,6 +201,27 @@ impl<'a> Runs<'a> {
                 Err(CliError::new(Kind::Timeout, format!("a run did not end within {seconds} s")))
             }),
             () = self.interrupts.recv() => Err(CliError::failed("interrupted")),
+        }
+    }
+}
+
+impl Files {
+    /// Those of a run on this machine.
+    pub(crate) fn of(session: &Session, name: &str) -> Self {
+        let directory = Directory::of(&session.paths.federations(), name);
+        Self {
+            trace: directory.trace(),
+            timing: directory.timing(),
+            _copied: None,
+        }
+    }
+
+    /// Those that were copied from other hosts.
+    fn copied(copied: Copied) -> Self {
+        Self {
+            trace: copied.path(FileKind::Trace),
+            timing: copied.path(FileKind::Timing),
+            _copied: Some(copied),
         }
     }
 }

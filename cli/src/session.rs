@@ -16,7 +16,7 @@ use tokio::runtime::Runtime;
 
 use crate::args::ManifestArgs;
 use crate::error::{CliError, Kind};
-use crate::hosts::{connect_all, others, ways};
+use crate::hosts::{Clients, connect_all, left, others, ways};
 use crate::ui::Ui;
 
 /// A command's connection to this user's daemon.
@@ -92,6 +92,17 @@ pub(crate) struct Abroad {
     pub(crate) ways: BTreeMap<String, Way>,
 }
 
+impl Abroad {
+    /// The daemons of all its hosts.
+    pub(crate) async fn clients(&self, session: &Session) -> Result<Clients, CliError> {
+        let connected = connect_all(session, &self.ways).await;
+        connected
+            .into_iter()
+            .map(|(host, client)| Ok((host, client?)))
+            .collect()
+    }
+}
+
 /// Which federation is meant, and where to look for it.
 #[derive(Clone, Debug, Default, Args)]
 pub(crate) struct Whereabouts {
@@ -101,6 +112,15 @@ pub(crate) struct Whereabouts {
 }
 
 impl Whereabouts {
+    /// The same as [`Self::find`], for those who are not asynchronous yet.
+    pub(crate) fn abroad(
+        &self,
+        session: &Session,
+        given: Option<&str>,
+    ) -> Result<Option<Abroad>, CliError> {
+        session.block_on(self.find(session, given))
+    }
+
     /// The hosts that are meant, by `--host` or by a manifest with hosts; absent: this machine.
     pub(crate) async fn find(
         &self,
@@ -135,11 +155,22 @@ impl Whereabouts {
             (target.clone(), way)
         });
         let given_ways: BTreeMap<String, Way> = given_ways.collect();
-        let mut views = Vec::new();
+        let (mut views, mut clients) = (Vec::new(), Vec::new());
+        // What was taken down has logs and generations yet.
+        let mut names = BTreeSet::new();
         for (_, client) in connect_all(session, &given_ways).await {
-            views.extend(client?.federations().await?);
+            let client = client?;
+            views.extend(client.federations().await?);
+            names.extend(client.names().await?);
+            clients.push(client);
         }
-        let known: BTreeSet<&str> = views.iter().map(|view| view.name.as_str()).collect();
+        let running: BTreeSet<&str> = views.iter().map(|view| view.name.as_str()).collect();
+        let all: BTreeSet<&str> = names.iter().map(String::as_str).collect();
+        let known = if given.is_some() || running.is_empty() {
+            all
+        } else {
+            running
+        };
         let known = known.into_iter().collect::<Vec<_>>();
         let name = match (given, known.as_slice()) {
             (Some(given), _) if known.contains(&given) => given.to_owned(),
@@ -154,7 +185,10 @@ impl Whereabouts {
             }
             (None, []) => return Err(CliError::failed("there is no federation there")),
         };
-        let found = others(&views, &name);
+        let mut found = others(&views, &name);
+        if found.is_empty() {
+            found = left(&clients, &name).await;
+        }
         // One that is whole on its host has no record of others.
         let ways = if found.is_empty() { given_ways } else { found };
         Ok(Abroad { name, ways })

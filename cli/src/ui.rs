@@ -49,6 +49,16 @@ impl Ui {
         }
     }
 
+    /// One that says nothing, for work within other work.
+    pub(crate) fn silent() -> Self {
+        Self {
+            output: Output::Table,
+            quiet: true,
+            screen: Screen::None,
+            unfinished: false,
+        }
+    }
+
     /// Whether results are for programs.
     pub(crate) fn json(&self) -> bool {
         self.output == Output::Json

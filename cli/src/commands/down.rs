@@ -4,21 +4,22 @@ use std::time::Duration;
 
 use clap::Args;
 use ictus_deploy::placement::Way;
+use ictusd::api::recorded::Kept;
 
 use super::events::describe_outcome;
 use crate::args::duration;
 use crate::error::CliError;
 use crate::interrupts::Interrupts;
-use crate::rollout::{self, Executor};
+use crate::rollout::{self, Executor, size};
 use crate::session::{Abroad, Session, Whereabouts, within};
 use crate::ui::Ui;
 
-/// Stop a federation and remove all but its logs, which it names
+/// Stop a federation and remove all but its logs and generations, which it names
 #[derive(Debug, Args)]
 pub(crate) struct Down {
     /// The federation: its name or manifest; may be left out when there is one
     name: Option<String>,
-    /// Remove the logs, too
+    /// Remove the logs and the generations, too
     #[arg(long)]
     purge: bool,
     #[command(flatten)]
@@ -32,7 +33,7 @@ impl Down {
     pub(crate) fn run(&self, ui: &mut Ui) -> Result<(), CliError> {
         let session = Session::new()?;
         let given = self.name.as_deref();
-        if let Some(abroad) = session.block_on(self.at.find(&session, given))? {
+        if let Some(abroad) = self.at.abroad(&session, given)? {
             return session.block_on(self.everywhere(ui, &session, &abroad));
         }
         let name = session.name(self.name.as_deref())?;
@@ -45,8 +46,8 @@ impl Down {
                 "down",
                 &how.map_or_else(|| name.clone(), |how| format!("{name}: {how}")),
             );
-            for kept in &removed.kept {
-                ui.stage("kept", &kept.display().to_string());
+            for Kept { path, bytes } in &removed.kept {
+                ui.stage("kept", &format!("{}, {}", path.display(), size(*bytes)));
             }
             if !removed.kept.is_empty() {
                 ui.message(&format!("`ictus down {name} --purge` removes them"));
@@ -73,8 +74,15 @@ impl Down {
             ui.message(&plan.to_string());
         } else {
             let executor = Executor::down(clients, plan)?;
-            executor.run(ui, &mut interrupts, self.timeout).await?;
+            let verdict = executor.run(ui, &mut interrupts, self.timeout).await?;
             ui.stage("down", &abroad.name);
+            for (host, Kept { path, bytes }) in &verdict.kept {
+                let what = format!("{host}: {}, {}", path.display(), size(*bytes));
+                ui.stage("kept", &what);
+            }
+            if !verdict.kept.is_empty() {
+                ui.message("the same with `--purge` removes them");
+            }
         }
         if local {
             session.daemon().await?.end().await?;

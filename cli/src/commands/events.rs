@@ -1,11 +1,14 @@
 //! `ictus events`: what happened to federations.
 
+use std::collections::BTreeMap;
+
 use clap::Args;
 use ictusd::api::{Event, Happening, Outcome};
 use ictusd::stamp;
 
 use crate::error::CliError;
-use crate::session::Session;
+use crate::hosts::merge::Merged;
+use crate::session::{Abroad, Session, Whereabouts};
 use crate::ui::{Ui, nanoseconds, one_line};
 
 /// Show what happened to federations
@@ -14,13 +17,18 @@ pub(crate) struct Events {
     /// Go on until Ctrl-C
     #[arg(short, long)]
     follow: bool,
-    /// Only of this federation
+    /// Only of this federation: its name or manifest
     name: Option<String>,
+    #[command(flatten)]
+    at: Whereabouts,
 }
 
 impl Events {
     pub(crate) fn run(&self, ui: &mut Ui) -> Result<(), CliError> {
         let session = Session::new()?;
+        if let Some(abroad) = self.at.abroad(&session, self.name.as_deref())? {
+            return session.block_on(self.everywhere(ui, &session, &abroad));
+        }
         let name = self
             .name
             .as_deref()
@@ -33,18 +41,56 @@ impl Events {
             let client = session.daemon().await?;
             let mut events = client.events(name.as_deref(), self.follow).await?;
             while let Some(happening) = events.next().await? {
-                ui.result(&happening, || {
-                    let Happening {
-                        at_ns,
-                        federation,
-                        event,
-                    } = &happening;
-                    format!("{} {federation}: {}", stamp::text(*at_ns), describe(event))
-                })?;
+                let federation = &happening.federation;
+                print(ui, &happening, federation)?;
             }
             Ok(())
         })
     }
+
+    /// Those of all hosts: what is kept by time, what comes as it comes.
+    async fn everywhere(
+        &self,
+        ui: &mut Ui,
+        session: &Session,
+        abroad: &Abroad,
+    ) -> Result<(), CliError> {
+        let name = Some(abroad.name.as_str());
+        let (mut merged, mut kept) = (Merged::new(), Vec::new());
+        // A stream that follows begins with what is kept: so much of it was shown already.
+        let mut shown: BTreeMap<String, usize> = BTreeMap::new();
+        for (host, client) in abroad.clients(session).await? {
+            if self.follow {
+                merged.add(host.clone(), client.events(name, true).await?);
+            }
+            let mut stream = client.events(name, false).await?;
+            while let Some(happening) = stream.next().await? {
+                *shown.entry(host.clone()).or_default() += 1;
+                kept.push((happening.at_ns, host.clone(), happening));
+            }
+        }
+        // Of one host in the order in which it told them.
+        kept.sort_by_key(|(at_ns, ..)| *at_ns);
+        for (_, host, happening) in &kept {
+            print(ui, happening, host)?;
+        }
+        while let Some((host, happening)) = merged.next().await {
+            let happening = happening?;
+            match shown.get_mut(&host) {
+                Some(left @ 1..) => *left -= 1,
+                Some(0) | None => print(ui, &happening, &host)?,
+            }
+        }
+        Ok(())
+    }
+}
+
+/// One line: when, where, what.
+fn print(ui: &mut Ui, happening: &Happening, place: &str) -> Result<(), CliError> {
+    ui.result(happening, || {
+        let Happening { at_ns, event, .. } = happening;
+        format!("{} {place}: {}", stamp::text(*at_ns), describe(event))
+    })
 }
 
 /// An event in words.

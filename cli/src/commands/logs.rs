@@ -29,7 +29,7 @@ impl Logs {
     pub(crate) fn run(&self, ui: &mut Ui) -> Result<(), CliError> {
         let session = Session::new()?;
         let first = self.names.first().map(String::as_str);
-        if let Some(abroad) = session.block_on(self.at.find(&session, first))? {
+        if let Some(abroad) = self.at.abroad(&session, first)? {
             return session.block_on(self.everywhere(ui, &session, &abroad));
         }
         let (name, federates) = self.split(&session)?;

@@ -1,7 +1,7 @@
 //! `ictus plan`: what runs, how it is connected, and how long each federate waits and why.
 
 use std::collections::BTreeMap;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use clap::Args;
 use ictus_coord::plan::{ClockSync, ConnectionPlan, Coordination, Endpoint, FederatePlan, Plan};
@@ -22,6 +22,12 @@ pub(crate) struct PlanCommand {
     /// Run nothing the manifest names; widths, serializers and types are then not known
     #[arg(long)]
     no_build: bool,
+    /// Plan a run whose federates write their logical traces
+    #[arg(long)]
+    trace: bool,
+    /// Write what would be done on the manifest's hosts to a file, for `ictus up --plan FILE`
+    #[arg(long, value_name = "FILE", conflicts_with = "no_build")]
+    out: Option<PathBuf>,
 }
 
 /// The answer for programs.
@@ -47,11 +53,20 @@ impl PlanCommand {
         };
         let hosts = checked.placement.as_ref().filter(|_| !self.no_build);
         let Some(placement) = hosts else {
+            if self.out.is_some() {
+                let message = "only what is done on hosts can be planned ahead";
+                return Err(CliError::failed(message).hint("the manifest names no `hosts`"));
+            }
             return ui.result(&answer, || text(&checked));
         };
         let session = Session::new()?;
-        let rollout = Rollout::new(&session, &checked, placement, false);
-        let plan = session.block_on(rollout)?.plan;
+        let rollout = Rollout::new(&session, &checked, placement, self.trace);
+        let rollout = session.block_on(rollout)?;
+        if let Some(out) = &self.out {
+            rollout.saved(&self.manifest.set).write(out)?;
+            ui.stage("saved", &out.display().to_string());
+        }
+        let plan = rollout.plan;
         let answer = serde_json::json!({ "federation": answer, "rollout": plan });
         ui.result(&answer, || format!("{}\n\n{plan}", text(&checked)))?;
         if plan.is_empty() {

@@ -1,12 +1,15 @@
 //! `ictus ps`: federations and federates.
 
+use std::collections::BTreeMap;
 use std::time::Duration;
 
 use clap::Args;
 use ictusd::api::{FederationView, MemberView, Outcome, State};
+use ictusd::stamp;
+use serde::Serialize;
 
 use crate::error::{CliError, Kind};
-use crate::hosts::connect_all;
+use crate::hosts::{Clients, connect_all};
 use crate::session::{Abroad, Session, Whereabouts, ago};
 use crate::ui::{Table, Ui, nanoseconds, one_line};
 
@@ -29,7 +32,7 @@ impl Ps {
     pub(crate) fn run(&self, ui: &mut Ui) -> Result<(), CliError> {
         let session = Session::new()?;
         let given = self.name.as_deref();
-        if let Some(abroad) = session.block_on(self.at.find(&session, given))? {
+        if let Some(abroad) = self.at.abroad(&session, given)? {
             return session.block_on(self.everywhere(ui, &session, &abroad));
         }
         let only = given.map(|given| session.name(Some(given))).transpose()?;
@@ -60,37 +63,167 @@ impl Ps {
         session: &Session,
         abroad: &Abroad,
     ) -> Result<(), CliError> {
-        let connected = connect_all(session, &abroad.ways).await;
+        let mut hosts = Hosts::new(abroad);
         loop {
-            let (mut views, mut silent) = (Vec::new(), Vec::new());
-            for (host, client) in &connected {
-                match client {
-                    Ok(client) => match client.federations().await {
-                        Ok(found) => {
-                            views.extend(found.into_iter().filter(|it| it.name == abroad.name));
-                        }
-                        Err(error) => silent.push((host, CliError::from(error).to_string())),
-                    },
-                    Err(error) => silent.push((host, error.to_string())),
-                }
-            }
+            hosts.look(session).await;
             if self.watch && ui.can_redraw() {
                 ui.clear()?;
             }
-            show(ui, &views)?;
-            // What cannot be asked is unknown, and nothing else.
-            for (host, why) in &silent {
-                ui.warning(&format!("{host}: unknown: {why}"));
-            }
+            hosts.show(ui)?;
             if !self.watch {
-                let error = silent.into_iter().next();
-                return error.map_or(Ok(()), |(_, why)| {
-                    Err(CliError::new(Kind::Unreachable, why))
-                });
+                return hosts.result();
             }
             tokio::time::sleep(PERIOD).await;
         }
     }
+}
+
+/// What is known of each host; what cannot be asked is unknown, and nothing else.
+struct Hosts<'a> {
+    abroad: &'a Abroad,
+    clients: Clients,
+    seen: BTreeMap<String, Seen>,
+}
+
+/// What a host said last.
+#[derive(Default)]
+struct Seen {
+    view: Option<FederationView>,
+    /// When, nanoseconds since the Unix epoch; absent when it never did.
+    heard_ns: Option<i64>,
+    /// Why it cannot be asked now.
+    silent: Option<String>,
+}
+
+/// A host that cannot be asked, for programs.
+#[derive(Serialize)]
+struct Unknown<'a> {
+    name: &'a str,
+    host: &'a str,
+    state: &'static str,
+    /// When it was last heard of, nanoseconds since the Unix epoch; null when not since this command began.
+    since_ns: Option<i64>,
+    why: &'a str,
+}
+
+impl<'a> Hosts<'a> {
+    fn new(abroad: &'a Abroad) -> Self {
+        Self {
+            abroad,
+            clients: Clients::new(),
+            seen: BTreeMap::new(),
+        }
+    }
+
+    /// Asks all; those that are not connected are tried again.
+    async fn look(&mut self, session: &Session) {
+        let ways = self.abroad.ways.iter();
+        let lost = ways.filter(|(host, _)| !self.clients.contains_key(*host));
+        let lost = lost
+            .map(|(host, way)| (host.clone(), way.clone()))
+            .collect();
+        for (host, client) in connect_all(session, &lost).await {
+            match client {
+                Ok(client) => {
+                    self.clients.insert(host, client);
+                }
+                Err(error) => {
+                    self.seen.entry(host).or_default().silent = Some(error.to_string());
+                }
+            }
+        }
+        let asked = self.clients.iter().map(|(host, client)| async move {
+            let views = client.federations().await;
+            (
+                host.clone(),
+                views.map_err(|it| CliError::from(it).to_string()),
+            )
+        });
+        for (host, views) in futures_util::future::join_all(asked).await {
+            let seen = self.seen.entry(host.clone()).or_default();
+            match views {
+                Ok(views) => {
+                    let mut views = views.into_iter();
+                    *seen = Seen {
+                        view: views.find(|view| view.name == self.abroad.name),
+                        heard_ns: Some(stamp::now_ns()),
+                        silent: None,
+                    };
+                }
+                Err(why) => {
+                    seen.silent = Some(why);
+                    self.clients.remove(&host);
+                }
+            }
+        }
+    }
+
+    fn show(&self, ui: &mut Ui) -> Result<(), CliError> {
+        let silent = self.unknown();
+        let heard = self.seen.values().filter(|seen| seen.silent.is_none());
+        let views: Vec<_> = heard.filter_map(|seen| seen.view.as_ref()).collect();
+        if views.is_empty() && silent.is_empty() && !ui.json() {
+            ui.message("no federation; `ictus up MANIFEST` starts one");
+            return Ok(());
+        }
+        let all: Result<Vec<_>, _> = views
+            .iter()
+            .map(serde_json::to_value)
+            .chain(silent.iter().map(serde_json::to_value))
+            .collect();
+        ui.result(&all.map_err(CliError::failed)?, || {
+            let mut table = head();
+            for view in views {
+                rows(&mut table, view);
+            }
+            for Unknown {
+                name,
+                host,
+                since_ns,
+                ..
+            } in &silent
+            {
+                table.row([
+                    format!("{name} on {host}"),
+                    "-".to_owned(),
+                    since(*since_ns),
+                ]);
+            }
+            table.text()
+        })?;
+        for Unknown { host, why, .. } in silent {
+            ui.warning(&format!("{host}: unknown: {why}"));
+        }
+        Ok(())
+    }
+
+    fn unknown(&self) -> Vec<Unknown<'_>> {
+        let silent = self.seen.iter().filter_map(|(host, seen)| {
+            Some(Unknown {
+                name: &self.abroad.name,
+                host,
+                state: "unknown",
+                since_ns: seen.heard_ns,
+                why: seen.silent.as_deref()?,
+            })
+        });
+        silent.collect()
+    }
+
+    fn result(&self) -> Result<(), CliError> {
+        let first = self.unknown().into_iter().next();
+        first.map_or(Ok(()), |unknown| {
+            Err(CliError::new(Kind::Unreachable, unknown.why.to_owned()))
+        })
+    }
+}
+
+/// Since when nothing is known of a host.
+fn since(heard_ns: Option<i64>) -> String {
+    heard_ns.map_or_else(
+        || "unknown: it has not answered".to_owned(),
+        |ns| format!("unknown since {}", stamp::text(ns)),
+    )
 }
 
 fn show(ui: &mut Ui, views: &[FederationView]) -> Result<(), CliError> {
@@ -99,31 +232,40 @@ fn show(ui: &mut Ui, views: &[FederationView]) -> Result<(), CliError> {
         return Ok(());
     }
     ui.result(&views, || {
-        let head = [
-            "FEDERATION",
-            "MEMBER",
-            "STATE",
-            "PID",
-            "AT",
-            "TAGS",
-            "REACTIONS",
-            "MISSED",
-        ];
-        let mut table = Table::new(&head);
+        let mut table = head();
         for view in views {
-            let part = view.part.as_ref();
-            let name = part.map_or_else(
-                || view.name.clone(),
-                |part| format!("{} on {}", view.name, part.host),
-            );
-            table.row([name, "-".to_owned(), state(view)]);
-            let rti = part.is_none_or(|part| part.rti).then_some(&view.rti);
-            for member in rti.into_iter().chain(&view.federates) {
-                table.row(row(member));
-            }
+            rows(&mut table, view);
         }
         table.text()
     })
+}
+
+fn head() -> Table {
+    let head = [
+        "FEDERATION",
+        "MEMBER",
+        "STATE",
+        "PID",
+        "AT",
+        "TAGS",
+        "REACTIONS",
+        "MISSED",
+    ];
+    Table::new(&head)
+}
+
+/// A federation, or a host's part of one, and its members.
+fn rows(table: &mut Table, view: &FederationView) {
+    let part = view.part.as_ref();
+    let name = part.map_or_else(
+        || view.name.clone(),
+        |part| format!("{} on {}", view.name, part.host),
+    );
+    table.row([name, "-".to_owned(), state(view)]);
+    let rti = part.is_none_or(|part| part.rti).then_some(&view.rti);
+    for member in rti.into_iter().chain(&view.federates) {
+        table.row(row(member));
+    }
 }
 
 fn row(member: &MemberView) -> [String; 8] {

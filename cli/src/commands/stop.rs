@@ -9,7 +9,10 @@ use ictusd::client::Stream;
 use super::events::{describe, describe_outcome};
 use crate::args::duration;
 use crate::error::CliError;
-use crate::session::{Session, succeed, within};
+use crate::hosts;
+use crate::interrupts::Interrupts;
+use crate::rollout::{self, Executor};
+use crate::session::{Abroad, Session, Whereabouts, succeed, within};
 use crate::ui::Ui;
 
 /// Stop a federation at an agreed tag; `ps` and `logs` still know it
@@ -17,6 +20,8 @@ use crate::ui::Ui;
 pub(crate) struct Stop {
     /// The federation: its name or manifest; may be left out when there is one
     name: Option<String>,
+    #[command(flatten)]
+    at: Whereabouts,
     /// End every process at once
     #[arg(long)]
     kill: bool,
@@ -28,6 +33,10 @@ pub(crate) struct Stop {
 impl Stop {
     pub(crate) fn run(&self, ui: &mut Ui) -> Result<(), CliError> {
         let session = Session::new()?;
+        let given = self.name.as_deref();
+        if let Some(abroad) = self.at.abroad(&session, given)? {
+            return session.block_on(self.everywhere(ui, &session, &abroad));
+        }
         let name = session.name(self.name.as_deref())?;
         session.block_on(async {
             let client = session.daemon().await?;
@@ -37,6 +46,32 @@ impl Stop {
             ui.result(&outcome, String::new)?;
             succeed(&name, &outcome)
         })
+    }
+
+    /// The same of every part, at a tag on which all agree.
+    async fn everywhere(
+        &self,
+        ui: &mut Ui,
+        session: &Session,
+        abroad: &Abroad,
+    ) -> Result<(), CliError> {
+        let mut interrupts = Interrupts::new()?;
+        let name = &abroad.name;
+        let (clients, plan) = rollout::stop(session, name, &abroad.ways).await?;
+        if plan.is_empty() {
+            ui.message(&format!("{name}: nothing of it runs"));
+        } else {
+            let executor = Executor::stop(clients.clone(), plan, self.kill)?;
+            executor.run(ui, &mut interrupts, self.timeout).await?;
+        }
+        let merged = hosts::outcome::of_all(&clients, name).await?;
+        let Some(ended) = &merged.ended else {
+            return hosts::outcome::succeed(name, &merged);
+        };
+        let how = hosts::outcome::describe(ended);
+        ui.stage("ended", &format!("{name}: {how}"));
+        ui.result(ended, String::new)?;
+        hosts::outcome::succeed(name, &merged)
     }
 }
 

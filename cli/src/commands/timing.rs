@@ -2,6 +2,7 @@
 
 use std::fs;
 use std::path::Path;
+use std::time::Duration;
 
 use clap::Args;
 use ictus_coord::plan::{Coordination, Plan};
@@ -10,15 +11,22 @@ use ictus_deploy::TimingSpec;
 use ictus_deploy::timing::{
     BoundsReport, Suggestion, TimingReport, bounds_report, report, report_runs, suggest,
 };
+use ictusd::api::recorded::FileKind;
 use ictusd::store::Directory;
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 
 use crate::args::ManifestArgs;
 use crate::error::CliError;
+use crate::hosts::Clients;
+use crate::hosts::clocks::ClockBounds;
+use crate::hosts::copied::Copied;
 use crate::runs::Runs;
-use crate::session::{Session, checked};
+use crate::session::{Abroad, Session, Whereabouts, checked};
 use crate::ui::Ui;
+
+/// How often `--watch` looks.
+const PERIOD: Duration = Duration::from_secs(1);
 
 /// Show order and latency of a run, or of several new ones
 ///
@@ -29,6 +37,11 @@ use crate::ui::Ui;
 pub(crate) struct Timing {
     /// The federation: its name or manifest; may be left out when there is one
     name: Option<String>,
+    #[command(flatten)]
+    at: Whereabouts,
+    /// Show it again every second, until Ctrl-C
+    #[arg(short, long, conflicts_with_all = ["runs", "suggest"])]
+    watch: bool,
     /// Run the manifest so many times and compare the runs
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1000))]
     runs: Option<u32>,
@@ -56,36 +69,94 @@ struct Answer {
     /// Absent under centralized coordination.
     #[serde(skip_serializing_if = "Option::is_none")]
     bounds: Option<BoundsReport>,
+    /// Absent on one host.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    clocks: Option<ClockBounds>,
 }
 
 impl Timing {
     pub(crate) fn run(&self, ui: &mut Ui) -> Result<(), CliError> {
         let session = Session::new()?;
-        if self.suggest {
-            let found = self.suggestion(&session)?;
-            return ui.result(&found, || found.to_string());
-        }
-        let answer = match self.runs {
-            Some(runs) => Answer {
+        if let Some(runs) = self.runs {
+            let answer = Answer {
                 timing: self.over_runs(ui, &session, runs)?,
                 bounds: None,
-            },
-            None => of_last_run(&session, self.name.as_deref())?,
-        };
-        ui.result(&answer, || answer.text())
+                clocks: None,
+            };
+            return ui.result(&answer, || answer.text());
+        }
+        let given = self.name.as_deref();
+        if let Some(abroad) = self.at.abroad(&session, given)? {
+            return session.block_on(self.everywhere(ui, &session, &abroad));
+        }
+        if self.suggest {
+            let name = session.name(given)?;
+            let directory = Directory::of(&session.paths.federations(), &name);
+            let plan: Plan = read(&directory.plan())?;
+            let found = self.suggestion(&plan, || measured(&session, &name))?;
+            return ui.result(&found, || found.to_string());
+        }
+        loop {
+            let answer = of_last_run(&session, given)?;
+            self.show(ui, &answer)?;
+            if !self.watch {
+                return Ok(());
+            }
+            std::thread::sleep(PERIOD);
+        }
     }
 
-    fn suggestion(&self, session: &Session) -> Result<Suggestion, CliError> {
-        let name = session.name(self.name.as_deref())?;
-        let directory = Directory::of(&session.paths.federations(), &name);
-        let plan: Plan = read(&directory.plan())?;
+    /// The same of a run over hosts: their files are copied here, each time only what is new.
+    async fn everywhere(
+        &self,
+        ui: &mut Ui,
+        session: &Session,
+        abroad: &Abroad,
+    ) -> Result<(), CliError> {
+        let clients = abroad.clients(session).await?;
+        let name = &abroad.name;
+        let mut copied = Copied::new(&clients, name).await?;
+        if self.suggest {
+            let measures = all_measures(&clients, name).await?;
+            let found = self.suggestion(&copied.plan, || Ok(measures))?;
+            return ui.result(&found, || found.to_string());
+        }
+        loop {
+            copied.update(&clients, FileKind::Timing).await?;
+            let measures = all_measures(&clients, name).await?;
+            let files = copied.path(FileKind::Timing);
+            let answer = Answer {
+                clocks: ClockBounds::ask(&clients, name).await?,
+                ..Answer::of(&files, (&copied.plan, &copied.timing), || Ok(measures))?
+            };
+            self.show(ui, &answer)?;
+            if !self.watch {
+                return Ok(());
+            }
+            tokio::time::sleep(PERIOD).await;
+        }
+    }
+
+    fn show(&self, ui: &mut Ui, answer: &Answer) -> Result<(), CliError> {
+        if self.watch && ui.can_redraw() {
+            ui.clear()?;
+        }
+        ui.result(answer, || answer.text())
+    }
+
+    fn suggestion(
+        &self,
+        plan: &Plan,
+        measured: impl FnOnce() -> Result<FederationMeasures, CliError>,
+    ) -> Result<Suggestion, CliError> {
+        let name = &plan.federation;
         if plan.coordination == Coordination::Centralized {
             let message =
                 format!("federation `{name}` is coordinated centrally: nobody waits an offset");
             return Err(CliError::failed(message)
                 .hint("run it with `coordination: decentralized` and generous offsets first"));
         }
-        let found = suggest(&plan, &measured(session, &name)?, u32::from(self.margin));
+        let found = suggest(plan, &measured()?, u32::from(self.margin));
         if found.is_empty() {
             let error = CliError::failed(format!("no message of `{name}` was measured"));
             return Err(error.hint("federates tell what they measured once a second"));
@@ -112,7 +183,7 @@ impl Timing {
             for run in 1..=number {
                 ui.progress("running", &format!("{run} of {number}"));
                 match runs.federated(&checked.plan, false).await {
-                    Ok(directory) => directories.push(directory.timing()),
+                    Ok(files) => directories.push(files),
                     Err(error) => {
                         result = Err(error);
                         break;
@@ -120,6 +191,8 @@ impl Timing {
                 }
             }
             let report = result.and_then(|()| {
+                let directories = directories.iter().map(|it| it.timing.clone());
+                let directories: Vec<_> = directories.collect();
                 report_runs(&directories, &checked.timing, &checked.plan).map_err(CliError::failed)
             });
             runs.remove(ui).await;
@@ -129,10 +202,33 @@ impl Timing {
 }
 
 impl Answer {
+    /// Reads a run's files; what was measured is only asked for under decentralized coordination.
+    fn of(
+        files: &Path,
+        (plan, spec): (&Plan, &TimingSpec),
+        measured: impl FnOnce() -> Result<FederationMeasures, CliError>,
+    ) -> Result<Self, CliError> {
+        let bounds = match plan.coordination {
+            Coordination::Centralized => None,
+            Coordination::Decentralized => bounds_report(plan, &measured()?),
+        };
+        let timing = if spec.is_empty() && bounds.is_some() {
+            TimingReport::default()
+        } else {
+            report(files, spec, plan).map_err(CliError::failed)?
+        };
+        Ok(Self {
+            timing,
+            bounds,
+            clocks: None,
+        })
+    }
+
     fn text(&self) -> String {
         let timing = self.timing.to_string();
         let bounds = self.bounds.as_ref().map(ToString::to_string);
-        let parts = bounds.into_iter().chain([timing]);
+        let clocks = self.clocks.as_ref().map(ToString::to_string);
+        let parts = bounds.into_iter().chain([timing]).chain(clocks);
         let parts: Vec<String> = parts.filter(|part| !part.is_empty()).collect();
         parts.join("\n\n")
     }
@@ -143,16 +239,21 @@ fn of_last_run(session: &Session, name: Option<&str>) -> Result<Answer, CliError
     let directory = Directory::of(&session.paths.federations(), &name);
     let spec: TimingSpec = read(&directory.timing_spec())?;
     let plan: Plan = read(&directory.plan())?;
-    let bounds = match plan.coordination {
-        Coordination::Centralized => None,
-        Coordination::Decentralized => bounds_report(&plan, &measured(session, &name)?),
+    Answer::of(&directory.timing(), (&plan, &spec), || {
+        measured(session, &name)
+    })
+}
+
+/// What the federates of all hosts have measured.
+async fn all_measures(clients: &Clients, name: &str) -> Result<FederationMeasures, CliError> {
+    let mut all = FederationMeasures {
+        federation: name.to_owned(),
+        federates: Vec::new(),
     };
-    let timing = if spec.is_empty() && bounds.is_some() {
-        TimingReport::default()
-    } else {
-        report(&directory.timing(), &spec, &plan).map_err(CliError::failed)?
-    };
-    Ok(Answer { timing, bounds })
+    for client in clients.values() {
+        all.federates.extend(client.measures(name).await?.federates);
+    }
+    Ok(all)
 }
 
 /// What the federates have measured, from the daemon.

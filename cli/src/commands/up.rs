@@ -1,5 +1,6 @@
 //! `ictus up`: from a manifest to a healthy federation.
 
+use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
 use clap::Args;
@@ -13,7 +14,7 @@ use super::logs;
 use crate::args::{ManifestArgs, duration};
 use crate::error::{CliError, Kind};
 use crate::interrupts::Interrupts;
-use crate::rollout::{Executor, Rollout, size};
+use crate::rollout::{Executor, Rollout, SavedPlan, size};
 use crate::session::{Session, checked, count, request, succeed};
 use crate::ui::Ui;
 
@@ -37,6 +38,9 @@ pub(crate) struct Up {
     /// Have federates write their logical traces
     #[arg(long)]
     trace: bool,
+    /// Carry out exactly the plan that `ictus plan --out FILE` wrote; refused when a host or the manifest has moved on
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["manifest", "set", "trace", "attach"])]
+    plan: Option<PathBuf>,
     /// How long it may take to become healthy once it is built
     #[arg(long, value_name = "TIME", default_value = "5m", value_parser = duration)]
     timeout: Duration,
@@ -62,9 +66,14 @@ enum Start {
 impl Up {
     pub(crate) fn run(&self, ui: &mut Ui) -> Result<(), CliError> {
         let session = Session::new()?;
+        if let Some(plan) = &self.plan {
+            let saved = SavedPlan::read(plan)?;
+            return self.follow_plan(ui, &session, saved);
+        }
         let checked = checked(ui, &self.manifest, true)?;
         if let Some(placement) = &checked.placement {
-            return session.block_on(self.roll_out(ui, &session, (&checked, placement)));
+            let work = self.roll_out(ui, &session, (&checked, placement), None);
+            return session.block_on(work);
         }
         let request = request(&checked, self.trace);
         let name = checked.plan.federation.clone();
@@ -110,12 +119,33 @@ impl Up {
         })
     }
 
+    /// The same by a plan that was saved.
+    fn follow_plan(
+        &self,
+        ui: &mut Ui,
+        session: &Session,
+        saved: SavedPlan,
+    ) -> Result<(), CliError> {
+        let manifest = ManifestArgs {
+            manifest: saved.manifest.clone(),
+            set: saved.set.clone(),
+        };
+        let checked = checked(ui, &manifest, true)?;
+        let Some(placement) = &checked.placement else {
+            let message = format!("{} names no hosts any more", manifest.manifest.display());
+            return Err(CliError::new(Kind::Stale, message));
+        };
+        let work = self.roll_out(ui, session, (&checked, placement), Some(saved));
+        session.block_on(work)
+    }
+
     /// The same over the manifest's hosts.
     async fn roll_out(
         &self,
         ui: &mut Ui,
         session: &Session,
         (checked, placement): (&Checked, &Placement),
+        saved: Option<SavedPlan>,
     ) -> Result<(), CliError> {
         if self.attach {
             let message = "`--attach` is for federations of this machine";
@@ -123,7 +153,11 @@ impl Up {
         }
         let since = Instant::now();
         let mut interrupts = Interrupts::new()?;
-        let rollout = Rollout::new(session, checked, placement, self.trace).await?;
+        let trace = saved.as_ref().map_or(self.trace, |saved| saved.trace);
+        let mut rollout = Rollout::new(session, checked, placement, trace).await?;
+        if let Some(saved) = saved {
+            rollout.follow(saved)?;
+        }
         let name = &checked.plan.federation;
         if rollout.is_done() {
             ui.message(&format!("{name} is already running from the same manifest"));
@@ -143,7 +177,10 @@ impl Up {
         }
         let hosts = placement.hosts.iter().map(|host| host.name.clone());
         let hosts: Vec<_> = hosts.collect();
-        let manifest = self.manifest.manifest.display();
+        let manifest = match self.plan {
+            Some(_) => checked.manifest.display(),
+            None => self.manifest.manifest.display(),
+        };
         ui.result(&serde_json::json!({ "federation": name, "hosts": hosts }), || {
             let federates = count(checked.federates.len(), "federate");
             format!(

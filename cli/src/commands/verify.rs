@@ -5,6 +5,7 @@ use std::fmt;
 use std::time::Duration;
 
 use clap::{Args, ValueEnum};
+use ictus_coord::plan::Coordination;
 use ictus_deploy::Checked;
 use ictus_deploy::trace::{Record, TraceSet, Verdict, compare};
 use serde::Serialize;
@@ -26,6 +27,10 @@ pub(crate) struct Verify {
     /// How often the federation is run in each mode
     #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=1000))]
     runs: u32,
+    /// Compare what the last run has left (of `up --trace`, also on hosts) with one process, in place of running anew;
+    /// waits for its end
+    #[arg(long, conflicts_with_all = ["runs", "modes", "stp_offset"])]
+    last: bool,
     /// What is compared with the first of them; left out, all that the manifest can run
     #[arg(long, value_name = "MODE,...", value_enum, value_delimiter = ',')]
     modes: Vec<Mode>,
@@ -66,6 +71,9 @@ struct Answer {
     #[serde(skip_serializing_if = "Option::is_none")]
     offsets: Option<String>,
     runs: Vec<Run>,
+    /// The reference's traces.
+    #[serde(skip)]
+    first: Option<TraceSet>,
 }
 
 /// A run and how it compares with the reference.
@@ -86,22 +94,51 @@ impl Verify {
         }
         let session = Session::new()?;
         let checked = checked(ui, &self.manifest, true)?;
+        if self.last {
+            return session.block_on(self.of_last(ui, &session, &checked));
+        }
         let modes = self.modes(ui, &checked)?;
         self.offset_has_an_effect(&modes)?;
         session.block_on(async {
             let mut runs = Runs::new(&session, &checked).await?;
             let answer = self.compare(ui, &checked, (&mut runs, &modes)).await;
             runs.remove(ui).await;
-            let answer = answer?;
-            ui.result(&answer, || answer.text())?;
-            if answer.equal == answer.of {
-                return Ok(());
-            }
-            Err(CliError::failed(format!(
-                "equal only {} of {}",
-                answer.equal, answer.of
-            )))
+            answer?.tell(ui)
         })
+    }
+
+    /// Compares the run that is there, or was, with one process.
+    async fn of_last(
+        &self,
+        ui: &mut Ui,
+        session: &Session,
+        checked: &Checked,
+    ) -> Result<(), CliError> {
+        if let Some((why, hint)) = Mode::One.obstacle(checked) {
+            let message = format!("the federation cannot run in one process: {why}");
+            return Err(CliError::failed(message).hint(hint));
+        }
+        let mut runs = Runs::new(session, checked).await?;
+        let answer = async {
+            let (plan, files) = runs.last().await?;
+            let checked = Checked {
+                plan,
+                ..checked.clone()
+            };
+            let many = read(&files.trace, &checked)?;
+            let one = read(&runs.in_one_process(&checked.plan).await?, &checked)?;
+            let mode = match checked.plan.coordination {
+                Coordination::Centralized => Mode::Centralized,
+                Coordination::Decentralized => Mode::Decentralized,
+            };
+            let mut answer = Answer::new(&checked, Mode::One);
+            answer.add(ui, &Mode::One.to_string(), (Mode::One, one));
+            answer.add(ui, "the last run", (mode, many));
+            Ok(answer)
+        };
+        let answer: Result<Answer, CliError> = answer.await;
+        runs.remove(ui).await;
+        answer?.tell(ui)
     }
 
     /// Refuses `--stp-offset` when nothing runs decentralized, or when it is beyond sense.
@@ -159,19 +196,11 @@ impl Verify {
         let span = span.map(|span| i64::try_from(span.as_nanos()).unwrap_or(i64::MAX));
         let (decentralized, origin) = checked.decentralized(span);
         let centralized = checked.centralized();
-        let mut reference: Option<TraceSet> = None;
-        let mut answer = Answer {
-            federation: checked.plan.federation.clone(),
-            equal: 0,
-            of: 0,
-            reference: modes.first().copied().unwrap_or(Mode::One),
-            records_per_federate: BTreeMap::new(),
-            hash: String::new(),
-            offsets: modes
-                .contains(&Mode::Decentralized)
-                .then(|| origin.to_string()),
-            runs: Vec::new(),
-        };
+        let first = modes.first().copied().unwrap_or(Mode::One);
+        let mut answer = Answer::new(checked, first);
+        if modes.contains(&Mode::Decentralized) {
+            answer.offsets = Some(origin.to_string());
+        }
         for mode in modes {
             let often = if *mode == Mode::One { 1 } else { self.runs };
             for number in 1..=often {
@@ -186,29 +215,12 @@ impl Verify {
                     ),
                 };
                 ui.progress("running", &name);
-                let directory = match plan {
-                    None => runs.in_one_process().await?,
-                    Some(plan) => runs.federated(plan, true).await?.trace(),
+                let traces = match plan {
+                    None => read(&runs.in_one_process(&checked.plan).await?, checked)?,
+                    // Copies are removed when they are read.
+                    Some(plan) => read(&runs.federated(plan, true).await?.trace, checked)?,
                 };
-                let traces = read(&directory, checked)?;
-                match &reference {
-                    None => {
-                        ui.stage("ran", &format!("{name}: {}", traces.hash()));
-                        answer.hash = traces.hash();
-                        answer.records_per_federate = traces.records_per_federate();
-                        reference = Some(traces);
-                    }
-                    Some(reference) => {
-                        let run = Run::new(*mode, reference, &traces);
-                        ui.stage(
-                            "ran",
-                            &format!("{name}: {}", run.describe(answer.reference)),
-                        );
-                        answer.of += 1;
-                        answer.equal += u32::from(matches!(run.verdict, Verdict::Equal { .. }));
-                        answer.runs.push(run);
-                    }
-                }
+                answer.add(ui, &name, (*mode, traces));
             }
         }
         Ok(answer)
@@ -270,6 +282,47 @@ impl Run {
 }
 
 impl Answer {
+    fn new(checked: &Checked, reference: Mode) -> Self {
+        Self {
+            federation: checked.plan.federation.clone(),
+            equal: 0,
+            of: 0,
+            reference,
+            records_per_federate: BTreeMap::new(),
+            hash: String::new(),
+            offsets: None,
+            runs: Vec::new(),
+            first: None,
+        }
+    }
+
+    /// Takes a run's traces and says what they are: the first is what the others are compared with.
+    fn add(&mut self, ui: &mut Ui, name: &str, (mode, traces): (Mode, TraceSet)) {
+        let Some(reference) = &self.first else {
+            ui.stage("ran", &format!("{name}: {}", traces.hash()));
+            self.hash = traces.hash();
+            self.records_per_federate = traces.records_per_federate();
+            self.first = Some(traces);
+            return;
+        };
+        let run = Run::new(mode, reference, &traces);
+        let how = run.describe(self.reference);
+        ui.stage("ran", &format!("{name}: {how}"));
+        self.of += 1;
+        self.equal += u32::from(matches!(run.verdict, Verdict::Equal { .. }));
+        self.runs.push(run);
+    }
+
+    /// Shows it; anything but equality is a failure.
+    fn tell(&self, ui: &mut Ui) -> Result<(), CliError> {
+        ui.result(self, || self.text())?;
+        if self.equal == self.of {
+            return Ok(());
+        }
+        let (equal, of) = (self.equal, self.of);
+        Err(CliError::failed(format!("equal only {equal} of {of}")))
+    }
+
     fn text(&self) -> String {
         let mut records = Table::new(&["FEDERATE", "RECORDS"]);
         for (federate, number) in &self.records_per_federate {

@@ -7,9 +7,10 @@ use std::sync::Arc;
 use std::sync::atomic::AtomicU64;
 use std::time::{Duration, Instant};
 
-use ictus_deploy::rollout::{Apply, Moment, Operation, Outcome, Phase, Plan, Step, StepId};
+use ictus_deploy::rollout::{Apply, Moment, Operation, Outcome, Phase, Step, StepId};
 use ictusd::api::part::{CommitRequest, LeaseRequest, PrepareRequest};
-use ictusd::api::{self, ErrorCode, Event, Happening};
+use ictusd::api::recorded::Kept;
+use ictusd::api::{self, ErrorCode, Event, Happening, Removed};
 use ictusd::client::{Client, ClientError, Stream};
 use ictusd::{identity, stamp};
 use tokio::task::JoinSet;
@@ -23,6 +24,7 @@ use crate::hosts::merge::Merged;
 use crate::interrupts::Interrupts;
 use crate::ui::Ui;
 
+mod begin;
 mod stages;
 
 use stages::Stages;
@@ -33,7 +35,7 @@ const LEASE_TTL: Duration = Duration::from_secs(30);
 const RENEWAL: Duration = Duration::from_secs(8);
 
 /// What is to be prepared, for plans that start something.
-#[derive(Debug)]
+#[derive(Debug, Default)]
 struct Work {
     requests: BTreeMap<String, PrepareRequest>,
     files: BTreeMap<String, PathBuf>,
@@ -46,7 +48,7 @@ pub(crate) struct Executor {
     apply: Apply,
     federation: String,
     clients: Clients,
-    work: Option<Work>,
+    work: Work,
     who: String,
     fences: BTreeMap<String, u64>,
     /// Where the RTI listens.
@@ -63,6 +65,10 @@ pub(crate) struct Executor {
     committed: Option<Instant>,
     /// Bytes that went over the wire.
     sent: u64,
+    /// Whether what is stopped is killed.
+    kill: bool,
+    /// What removals have left, with its host.
+    kept: Vec<(String, Kept)>,
     /// The time that it had, once that is over.
     late: Option<Duration>,
 }
@@ -74,6 +80,8 @@ pub(crate) struct Verdict {
     pub(crate) sent: u64,
     /// From the first commit to health.
     pub(crate) commit: Option<Duration>,
+    /// What removals have left, with its host.
+    pub(crate) kept: Vec<(String, Kept)>,
 }
 
 /// What a step's call gave.
@@ -87,6 +95,7 @@ enum Effect {
     Nothing,
     Fence(u64),
     Sent(u64),
+    Left(Vec<Kept>),
     Began(Box<Stream<Happening>>),
     Renewed,
 }
@@ -106,6 +115,7 @@ impl Executor {
                 id: run.clone(),
                 digest: rollout.desired.digest.clone(),
                 facets: rollout.desired.facets.clone(),
+                generation: Some(rollout.generation),
                 request,
             };
             requests.insert(host.clone(), prepare);
@@ -121,17 +131,11 @@ impl Executor {
         };
         let federates = rollout.checked.federates.len();
         let apply = Apply::new(rollout.plan, run);
-        Ok(Self::new(apply, rollout.clients, Some(work), federates))
+        Ok(Self::new("up", apply, rollout.clients, (work, federates)))
     }
 
-    /// Carries out what takes a federation down.
-    pub(crate) fn down(clients: Clients, plan: Plan) -> Result<Self, CliError> {
-        let run = identity::random_id().map_err(CliError::failed)?;
-        Ok(Self::new(Apply::new(plan, run), clients, None, 0))
-    }
-
-    fn new(apply: Apply, clients: Clients, work: Option<Work>, federates: usize) -> Self {
-        let verb = if work.is_some() { "up" } else { "down" };
+    /// One that has not begun; `work` is empty where nothing is started.
+    fn new(verb: &str, apply: Apply, clients: Clients, (work, federates): (Work, usize)) -> Self {
         Self {
             federation: apply.plan().federation.clone(),
             apply,
@@ -148,6 +152,8 @@ impl Executor {
             origin: Instant::now(),
             committed: None,
             sent: 0,
+            kill: false,
+            kept: Vec::new(),
             late: None,
         }
     }
@@ -239,6 +245,7 @@ impl Executor {
             rti: self.rti,
             request: self.request(&step),
             file: self.file(&step),
+            kill: self.kill,
         };
         calls.spawn(call.make(step));
     }
@@ -247,7 +254,7 @@ impl Executor {
         let Operation::Prepare { previous } = &step.operation else {
             return None;
         };
-        let request = self.work.as_ref()?.requests.get(&step.host)?;
+        let request = self.work.requests.get(&step.host)?;
         Some(PrepareRequest {
             previous: previous.clone(),
             ..request.clone()
@@ -258,7 +265,7 @@ impl Executor {
         let Operation::SendBlob { digest, .. } = &step.operation else {
             return None;
         };
-        self.work.as_ref()?.files.get(digest).cloned()
+        self.work.files.get(digest).cloned()
     }
 
     fn take(&mut self, ui: &mut Ui, answer: Answer) {
@@ -276,6 +283,11 @@ impl Executor {
                 self.sent += bytes;
                 let detail = format!("{}: {} for {}", step.host, size(bytes), step.cause);
                 ui.stage("sent", &detail);
+            }
+            Effect::Left(kept) => {
+                let host = step.host.clone();
+                self.kept
+                    .extend(kept.into_iter().map(|it| (host.clone(), it)));
             }
             Effect::Began(stream) => {
                 self.parts.add(step.host.clone(), *stream);
@@ -346,7 +358,7 @@ impl Executor {
     }
 
     fn handle_listening(&mut self, host: &str, port: u16) {
-        let address = self.work.as_ref().and_then(|work| work.rti.as_ref());
+        let address = self.work.rti.as_ref();
         self.rti = address.map(|(_, address)| SocketAddrV4::new(*address, port));
         if let Some((_, step)) = self.listening.take_if(|(at, _)| at == host) {
             self.apply.handle_done(self.now(), step, Outcome::Done);
@@ -409,6 +421,7 @@ impl Executor {
             Phase::Done => Ok(Verdict {
                 sent: self.sent,
                 commit,
+                kept: self.kept,
             }),
             Phase::Undone { cause, old_stopped } => {
                 let left = if *old_stopped {
@@ -455,6 +468,7 @@ struct Call {
     rti: Option<SocketAddrV4>,
     request: Option<PrepareRequest>,
     file: Option<PathBuf>,
+    kill: bool,
 }
 
 impl Call {
@@ -492,7 +506,7 @@ impl Call {
             }
             Operation::StopOld { run } | Operation::StopPart { run } => {
                 if self.is_there(run).await? {
-                    let mut stream = client.stop_part(key, false).await?;
+                    let mut stream = client.stop_part(key, self.kill).await?;
                     while stream.next().await?.is_some() {}
                 }
                 done
@@ -503,13 +517,14 @@ impl Call {
                     None => true,
                 };
                 if there {
-                    self.remove(*purge).await?;
+                    let removed = client.remove_part(key, *purge).await;
+                    return Ok((Outcome::Done, Effect::Left(left(removed)?)));
                 }
                 done
             }
             Operation::RemovePart { run } => {
                 if self.is_there(run).await? {
-                    self.remove(true).await?;
+                    left(client.undo_part(key).await)?;
                 }
                 done
             }
@@ -543,13 +558,13 @@ impl Call {
         // One whose record is damaged has no id, and may be this one.
         Ok(view.is_some_and(|view| view.id == run || view.id.is_empty()))
     }
+}
 
-    async fn remove(&self, purge: bool) -> Result<(), ClientError> {
-        let key = (self.federation.as_str(), self.fence);
-        match self.client.remove_part(key, purge).await {
-            Err(error) if is_unknown(&error) => Ok(()),
-            other => other.map(drop),
-        }
+/// What a removal has left; that there was nothing to remove is no error.
+fn left(removed: Result<Removed, ClientError>) -> Result<Vec<Kept>, ClientError> {
+    match removed {
+        Err(error) if is_unknown(&error) => Ok(Vec::new()),
+        other => other.map(|removed| removed.kept),
     }
 }
 

@@ -118,7 +118,10 @@ impl Host {
             let directory = self.directory(&name);
             let request = directory.read_request().ok();
             let part: Option<Part> = request.and_then(|request| request.part);
-            needed.extend(part.into_iter().flat_map(|part| part.programs.into_values()));
+            needed.extend(
+                part.into_iter()
+                    .flat_map(|part| part.programs.into_values()),
+            );
             needed.extend(self.history(&name).blobs());
         }
         needed

@@ -458,7 +458,9 @@ async fn down_keeps_the_logs_and_purge_keeps_nothing() {
     let at = |name: &str| world.directory("pair").join(name);
     fs::write(at("timing").join("a.timing"), "0\t0").unwrap();
     let removed = world.client.remove("pair", false).await.unwrap();
-    assert_eq!(removed.kept, [at("logs"), at("timing")]);
+    let kept: Vec<_> = removed.kept.iter().map(|it| it.path.clone()).collect();
+    assert_eq!(kept, [at("logs"), at("timing")]);
+    assert_eq!(removed.kept[1].bytes, 3, "and how large it is");
     assert!(!at("trace").exists(), "nothing was in it");
     assert!(world.client.federations().await.unwrap().is_empty());
     let mut logs = world

@@ -9,7 +9,7 @@ use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 use sha2::{Digest, Sha256};
 
-use crate::check::{Checked, FederateRun};
+use crate::check::{Checked, FederateRun, Settings};
 use crate::placement::{Engine, HostSpec, Placement, Way};
 
 /// Hexadecimal digits of a facet's digest: enough to tell two apart, few enough to keep with every record.
@@ -125,16 +125,25 @@ impl Desired {
         let files = program_files(checked, program)?;
         let facets = facets(checked, placement, trace, &files)?;
         let whole = json!({ "federation": checked.plan.federation, "facets": facets });
-        let settings = &checked.settings;
+        let (start_limit_ms, stop_limit_ms) = Self::limits(&checked.settings);
         Ok(Self {
             version: env!("CARGO_PKG_VERSION").to_owned(),
             federation: checked.plan.federation.clone(),
             digest: digest(&whole),
             hosts: hosts(checked, placement, &files),
             facets,
-            start_limit_ms: milliseconds(settings.join_timeout + START_MARGIN),
-            stop_limit_ms: milliseconds(settings.stop_grace + STOP_MARGIN),
+            start_limit_ms,
+            stop_limit_ms,
         })
+    }
+
+    /// How long a part may take until it is healthy, and how long an ordered stop may take, in milliseconds.
+    #[must_use]
+    pub fn limits(settings: &Settings) -> (u64, u64) {
+        (
+            milliseconds(settings.join_timeout + START_MARGIN),
+            milliseconds(settings.stop_grace + STOP_MARGIN),
+        )
     }
 
     /// Federates on all hosts.
