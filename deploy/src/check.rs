@@ -41,6 +41,9 @@ pub struct CheckOptions {
     pub target_dir: Option<PathBuf>,
     /// Values for names of the manifest's `let`, as written there (`--set half="0 ms"`).
     pub overrides: BTreeMap<String, String>,
+    /// Everything will run in containers (`ictus compose`), whatever the manifest says: programs are built static, and
+    /// what only containers give is there.
+    pub contained: bool,
 }
 
 impl Default for CheckOptions {
@@ -52,6 +55,7 @@ impl Default for CheckOptions {
             describe_timeout: Duration::from_secs(10),
             target_dir: None,
             overrides: BTreeMap::new(),
+            contained: false,
         }
     }
 }
@@ -100,6 +104,8 @@ pub struct Checked {
     pub offsets: Option<Offsets>,
     /// One per federate of the plan, in its order. Empty after a check without build.
     pub federates: Vec<FederateRun>,
+    /// Who starts it.
+    pub deploy: Deploy,
     /// Which member runs on which host; absent: all on this machine, as processes.
     pub placement: Option<Placement>,
     /// What the manifest says about the run itself.
@@ -134,6 +140,17 @@ pub struct FederateRun {
     /// package it is static then.
     #[serde(default)]
     pub portable: bool,
+}
+
+/// Who starts a federation.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Deploy {
+    /// The daemon of each host.
+    #[default]
+    Ictusd,
+    /// docker-compose on this machine, without a daemon.
+    Compose,
 }
 
 /// Whose command line a federate's program understands.
@@ -252,7 +269,8 @@ fn check_text(
         look_up: &look_up,
         read: &read_small,
     };
-    let seating = Seating::of(&manifest, &members, &outside, report);
+    let contained = options.contained || manifest.deploy == Deploy::Compose;
+    let seating = Seating::of(&manifest, &members, &outside, report).contained(contained);
     let outfits = needs::outfits(&members, &seating, &outside, report);
     let portable = portable(&members, &seating);
     let workshop = Workshop {
@@ -272,6 +290,7 @@ fn check_text(
         true => runs(&members, &executables, outfits, &seating),
         false => Vec::new(),
     };
+    seating.one_host(&manifest, report);
     let checked = conclude((absolute, &manifest), &members, &executables, report);
     Some(Checked {
         federates,
@@ -333,6 +352,7 @@ fn conclude(
         plan: plan::resolve(manifest, members, (wires, offsets.as_ref())),
         offsets,
         federates: Vec::new(),
+        deploy: manifest.deploy,
         placement: None,
         settings: settings(manifest),
         timing,

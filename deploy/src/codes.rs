@@ -227,6 +227,11 @@ pub(crate) const CODES: &[(&str, &str)] = &[
          of the same architecture. Prebuilt Lingua Franca federates and images may be of another one.",
     ),
     (
+        "F045",
+        "`deploy: compose` has docker-compose start everything on this machine, and `hosts` names several. \
+         Several hosts are the daemons' work: leave `deploy` out.",
+    ),
+    (
         "W001",
         "No connection leads to an input, so its reactions will not run.",
     ),

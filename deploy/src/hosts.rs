@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 
 use ictus_coord::plan::Coordination;
 
+use crate::check::Deploy;
 use crate::federation::{Member, Origin};
 use crate::manifest::{Host, Manifest, Port, PortsText, Security};
 use crate::placement::{Engine, HostSpec, Placement, PortRange, Way};
@@ -44,6 +45,8 @@ pub(crate) struct Seating<'a> {
     expected: bool,
     rti: Option<usize>,
     federates: Vec<Option<usize>>,
+    /// Whether everything runs in containers, whatever the hosts' engine.
+    contained: bool,
     /// What the hosts are; absent without hosts, and when anything is wrong with them.
     placement: Option<Placement>,
 }
@@ -64,6 +67,7 @@ impl<'a> Seating<'a> {
             expected,
             rti,
             federates,
+            contained: false,
             placement: None,
         };
         security(manifest, report);
@@ -88,8 +92,31 @@ impl<'a> Seating<'a> {
         seating
     }
 
+    /// The same, but everything runs in containers.
+    pub(crate) fn contained(self, contained: bool) -> Self {
+        Self { contained, ..self }
+    }
+
+    /// Reports several hosts when Compose is to start it, which has one.
+    pub(crate) fn one_host(&self, manifest: &Manifest, report: &mut Report) {
+        let used = self.used();
+        if manifest.deploy == Deploy::Compose && used.len() > 1 {
+            let names = used.iter().filter_map(|index| self.hosts.get(*index));
+            let names: Vec<_> = names.map(|(name, _)| name.as_str()).collect();
+            let message = format!(
+                "Compose starts what runs on one host, and this is on {}",
+                names.join(", ")
+            );
+            let fix = "remove `deploy: compose`, or all hosts but one";
+            report.add("F045", Place::value(&["deploy"]), message, fix);
+        }
+    }
+
     /// What runs a member; absent when its host is unknown.
     pub(crate) fn engine(&self, member: usize) -> Option<Engine> {
+        if self.contained {
+            return Some(Engine::Docker);
+        }
         if !self.expected {
             return Some(Engine::Process);
         }
@@ -103,8 +130,9 @@ impl<'a> Seating<'a> {
 
     /// Whether a member's program leaves this machine's processes: for another host, or into a container.
     pub(crate) fn travels(&self, member: usize) -> bool {
-        self.host(member)
-            .is_some_and(|(_, host)| host.ssh.is_some() || host.engine == Engine::Docker)
+        let host = self.host(member);
+        self.contained
+            || host.is_some_and(|(_, host)| host.ssh.is_some() || host.engine == Engine::Docker)
     }
 
     /// The placement; absent without hosts, and when anything is wrong with them.

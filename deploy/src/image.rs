@@ -46,6 +46,7 @@ pub struct Archive {
     diff_id: String,
     config: Vec<u8>,
     id: String,
+    name: Option<String>,
 }
 
 /// Why there is no archive.
@@ -167,6 +168,7 @@ impl Archive {
             machine,
             diff_id,
             config,
+            name: None,
         })
     }
 
@@ -177,9 +179,19 @@ impl Archive {
         &self.id
     }
 
-    /// The name under which it is loaded: `ictus:` and the beginning of its id.
+    /// The same image, loaded under another name.
+    #[must_use]
+    pub fn named(self, name: &str) -> Self {
+        let name = Some(name.to_owned());
+        Self { name, ..self }
+    }
+
+    /// The name under which it is loaded: `ictus:` and the beginning of its id, unless it was given another.
     #[must_use]
     pub fn reference(&self) -> String {
+        if let Some(name) = &self.name {
+            return name.clone();
+        }
         let digits = self.id.trim_start_matches("sha256:");
         format!("ictus:{}", &digits[..TAG_DIGITS])
     }
@@ -329,7 +341,7 @@ impl<R: Read> Read for Hashing<R> {
     }
 }
 
-fn hex(bytes: &[u8]) -> String {
+pub(crate) fn hex(bytes: &[u8]) -> String {
     bytes.iter().map(|byte| format!("{byte:02x}")).collect()
 }
 

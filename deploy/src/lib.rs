@@ -7,6 +7,7 @@
 mod causality;
 pub mod check;
 mod codes;
+pub mod compose;
 mod document;
 mod env_file;
 mod federation;
@@ -26,6 +27,7 @@ mod program;
 mod quantity;
 mod reactions;
 pub mod rollout;
+pub mod rti;
 mod spans;
 #[cfg(feature = "ssh")]
 pub mod ssh;
@@ -36,7 +38,7 @@ pub mod trace;
 mod wiring;
 
 pub use check::{
-    CheckOptions, Checked, FederateKind, FederateRun, Progress, Settings, check, schema,
+    CheckOptions, Checked, Deploy, FederateKind, FederateRun, Progress, Settings, check, schema,
 };
 pub use codes::explain;
 pub use manifest::COORDINATOR;

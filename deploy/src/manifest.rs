@@ -10,6 +10,8 @@ use schemars::{JsonSchema, Schema, SchemaGenerator, json_schema};
 use serde::Deserialize;
 use serde_json::Value;
 
+use crate::check::Deploy;
+
 pub(crate) use self::host::{Host, PortsText, Security};
 pub(crate) use self::needs::{RealtimeText, Secret, VolumeText};
 pub(crate) use self::scalar::{
@@ -18,7 +20,8 @@ pub(crate) use self::scalar::{
 };
 use self::scalar::{CountWord, Name};
 use self::words::{
-    ClockSyncWord, CoordinationWord, OnExceedWord, OnFailureWord, SecurityWord, WireWord,
+    ClockSyncWord, CoordinationWord, DeployWord, OnExceedWord, OnFailureWord, SecurityWord,
+    WireWord,
 };
 
 /// A federation: what runs, how it is connected, and how long.
@@ -62,6 +65,10 @@ pub(crate) struct Manifest {
     /// are made of it.
     #[serde(default)]
     pub(crate) bounds: AllBounds,
+    /// Who starts it: the daemons of the hosts, or docker-compose on this machine.
+    #[serde(default)]
+    #[schemars(with = "DeployWord")]
+    pub(crate) deploy: Deploy,
     /// Where it runs; left out, everything runs on this machine as processes.
     #[serde(default)]
     pub(crate) hosts: Named<Host>,

@@ -106,7 +106,7 @@ fn engine(member: &Member<'_>, (index, seating): (usize, &Seating<'_>), report: 
             ),
             None => (
                 format!("`{key}` needs engine docker, and without `hosts` federates are processes"),
-                "add `hosts: { here: { local: true, engine: docker } }`, or remove it".to_owned(),
+                "add `hosts: { here: { local: true, engine: docker } }` or `deploy: compose`, or remove it".to_owned(),
             ),
         };
         report.add("F035", Place::key(&at(key)), message, fix);

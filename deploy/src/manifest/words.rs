@@ -14,6 +14,18 @@ pub(crate) enum CoordinationWord {
     Decentralized,
 }
 
+/// Who starts a federation.
+#[derive(JsonSchema)]
+#[serde(rename_all = "lowercase")]
+#[schemars(inline)]
+#[expect(dead_code, reason = "only its schema is used")]
+pub(crate) enum DeployWord {
+    /// The daemons of the hosts, or of this machine.
+    Ictusd,
+    /// docker-compose on this machine, from the file that `ictus compose` prints.
+    Compose,
+}
+
 /// Layouts of messages.
 #[derive(JsonSchema)]
 #[schemars(inline)]

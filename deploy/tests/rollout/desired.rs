@@ -52,6 +52,7 @@ fn checked() -> Checked {
         },
         offsets: None,
         federates: vec![run(0, "a"), run(1, "b")],
+        deploy: ictus_deploy::Deploy::default(),
         placement: Some(Placement {
             hosts: vec![host("nuc", 1), host("pi", 2)],
             rti: 0,

@@ -10,7 +10,7 @@ pub(crate) enum Command {
     /// Describe the classes, or the instances requested in a file.
     Describe(Option<PathBuf>),
     /// Run federates of a plan.
-    Run(RunArgs),
+    Run(Box<RunArgs>),
     /// Print the usage.
     Help,
 }
@@ -19,12 +19,16 @@ pub(crate) enum Command {
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub(crate) struct RunArgs {
     pub(crate) plan: PathBuf,
+    /// The environment variable that has the plan in place of a file.
+    pub(crate) plan_env: Option<String>,
     pub(crate) federates: Vec<String>,
     pub(crate) rti: Option<String>,
     pub(crate) federation_id: Option<String>,
     pub(crate) trace: Option<PathBuf>,
     pub(crate) timing: Option<PathBuf>,
     pub(crate) status_fd: Option<u32>,
+    /// The Unix socket that takes status lines in place of a descriptor.
+    pub(crate) status_socket: Option<PathBuf>,
     /// Where other federates reach this one, when it is not the address by which it reaches the RTI.
     pub(crate) data_address: Option<Ipv4Addr>,
     /// From where other federates connect; empty: from everywhere.
@@ -51,6 +55,7 @@ pub(crate) enum ArgsError {
 pub(crate) const USAGE: &str = "\
 usage: PROGRAM --plan PLAN.json [--federate NAME]... [--rti HOST:PORT] [-i ID]
                [--data-address IPv4] [--allow IPv4[,IPv4]...] [--trace DIR] [--timing DIR] [--status-fd N]
+       PROGRAM --plan-env VARIABLE [--status-socket PATH] [...]
        PROGRAM --describe [INSTANCES.json]
 
 Without --rti the whole plan runs in this process. With --rti each named federate joins the RTI as itself.
@@ -73,6 +78,11 @@ pub(crate) fn parse(args: impl IntoIterator<Item = String>) -> Result<Command, A
                 run.plan = value()?.into();
                 has_plan = true;
             }
+            "--plan-env" => {
+                run.plan_env = Some(value()?);
+                has_plan = true;
+            }
+            "--status-socket" => run.status_socket = Some(value()?.into()),
             "--federate" => run.federates.push(value()?),
             "--rti" | "-r" => run.rti = Some(value()?),
             "-i" | "--id" => run.federation_id = Some(value()?),
@@ -98,7 +108,7 @@ pub(crate) fn parse(args: impl IntoIterator<Item = String>) -> Result<Command, A
         }
     }
     if has_plan {
-        Ok(Command::Run(run))
+        Ok(Command::Run(Box::new(run)))
     } else {
         Err(ArgsError::Nothing)
     }
@@ -135,7 +145,14 @@ mod tests {
         };
         let line =
             "--plan p.json --federate a --federate b --rti 127.0.0.1:15045 -i x --status-fd 3";
-        assert_eq!(words(line), Ok(Command::Run(run)));
+        assert_eq!(words(line), Ok(Command::Run(Box::new(run))));
+        let run = RunArgs {
+            plan_env: Some("ICTUS_PLAN".into()),
+            status_socket: Some("/s".into()),
+            ..RunArgs::default()
+        };
+        let line = "--plan-env ICTUS_PLAN --status-socket /s";
+        assert_eq!(words(line), Ok(Command::Run(Box::new(run))));
         assert_eq!(
             words("--plan p --allow 10.0.0.1,10.0.0."),
             Err(ArgsError::BadPeer("10.0.0.".into()))

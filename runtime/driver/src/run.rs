@@ -99,14 +99,7 @@ fn complain(message: &str, code: u8) -> ExitCode {
 }
 
 fn run_plan(args: &RunArgs, classes: &[Class]) -> Result<u8, RunError> {
-    let text = std::fs::read(&args.plan).map_err(|source| RunError::ReadPlan {
-        path: args.plan.clone(),
-        source,
-    })?;
-    let plan: Plan = serde_json::from_slice(&text).map_err(|source| RunError::ParsePlan {
-        path: args.plan.clone(),
-        source,
-    })?;
+    let plan = read_plan(args)?;
     let ids = named_federates(&plan, &args.federates)?;
     match &args.rti {
         None if ids.len() < plan.federates.len() => Err(RunError::NeedsRti),
@@ -125,6 +118,26 @@ fn run_plan(args: &RunArgs, classes: &[Class]) -> Result<u8, RunError> {
             run_each(&plan, args, classes, &ids, address)
         }
     }
+}
+
+/// The plan, from a file or, where there is no file to share (`ictus compose`), from the environment.
+fn read_plan(args: &RunArgs) -> Result<Plan, RunError> {
+    if let Some(name) = &args.plan_env {
+        let text = std::env::var(name).map_err(|_| RunError::NoPlan { name: name.clone() })?;
+        return serde_json::from_str(&text).map_err(|source| RunError::ParsePlan {
+            path: name.into(),
+            source,
+        });
+    }
+    let path = || args.plan.clone();
+    let text = std::fs::read(&args.plan).map_err(|source| RunError::ReadPlan {
+        path: path(),
+        source,
+    })?;
+    serde_json::from_slice(&text).map_err(|source| RunError::ParsePlan {
+        path: path(),
+        source,
+    })
 }
 
 /// Every named federate on a thread of its own; the worst exit code wins.
@@ -262,7 +275,7 @@ fn run_one(job: &Job<'_>, ids: &[u16], rti: Option<SocketAddr>) -> Result<u8, Ru
         sync,
         federate,
         bodies: assembly.bodies,
-        status: Status::new(job.args.status_fd).map_err(RunError::Status)?,
+        status: status_of(job.args).map_err(RunError::Status)?,
         start: Tag::NEVER,
         outside: Vec::new(),
         data_address: job.args.data_address,
@@ -272,6 +285,14 @@ fn run_one(job: &Job<'_>, ids: &[u16], rti: Option<SocketAddr>) -> Result<u8, Ru
     };
     transport::precise_waits();
     runner.run()
+}
+
+/// Where status lines go. Who takes them from a socket may come later, or go away: that is no reason to fail.
+fn status_of(args: &RunArgs) -> io::Result<Status> {
+    match &args.status_socket {
+        Some(path) => Ok(Status::to_socket(path)),
+        None => Status::new(args.status_fd),
+    }
 }
 
 /// The clock that one federate's plan asks for; several in one process have one host's.

@@ -4,11 +4,16 @@ use ictus_coord::measure::Measures;
 use ictus_coord::report::{self, FederateStatus};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::fs::OFlags;
+use rustix::net::{AddressFamily, SocketAddrUnix, SocketFlags, SocketType, connect, socket_with};
 use std::collections::VecDeque;
 use std::fs::{File, OpenOptions};
 use std::io::{self, Write};
 use std::os::unix::fs::OpenOptionsExt;
+use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
 
+/// How often it is looked whether somebody listens on the socket.
+const LOOK_EVERY: Duration = Duration::from_millis(500);
 /// Lines that wait for a reader that does not read; later ones are dropped.
 const WAITING_MAX: usize = 1024;
 /// How long the last line may wait for each bit of room.
@@ -22,9 +27,30 @@ const LAST_ROOM_MAX: Timespec = Timespec {
 #[derive(Debug)]
 pub(crate) struct Status {
     pipe: Option<File>,
+    socket: Option<Socket>,
     waiting: VecDeque<Vec<u8>>,
     /// Bytes of the first waiting line that were written already.
     written: usize,
+}
+
+/// A Unix socket on which somebody may listen, now or later.
+#[derive(Debug)]
+struct Socket {
+    path: PathBuf,
+    /// When to look again.
+    again: Instant,
+}
+
+impl Socket {
+    /// Connects without waiting.
+    fn connect(&mut self) -> Option<File> {
+        self.again = Instant::now() + LOOK_EVERY;
+        let address = SocketAddrUnix::new(&self.path).ok()?;
+        let flags = SocketFlags::CLOEXEC | SocketFlags::NONBLOCK;
+        let socket = socket_with(AddressFamily::UNIX, SocketType::STREAM, flags, None).ok()?;
+        connect(&socket, &address).ok()?;
+        Some(File::from(socket))
+    }
 }
 
 impl Status {
@@ -39,14 +65,29 @@ impl Status {
         };
         Ok(Self {
             pipe: fd.map(open).transpose()?,
+            socket: None,
             waiting: VecDeque::new(),
             written: 0,
         })
     }
 
-    /// Whether anybody listens.
+    /// Status for whoever listens on a Unix socket; looked for again while nobody does.
+    pub(crate) fn to_socket(path: &Path) -> Self {
+        let mut socket = Socket {
+            path: path.to_path_buf(),
+            again: Instant::now(),
+        };
+        Self {
+            pipe: socket.connect(),
+            socket: Some(socket),
+            waiting: VecDeque::new(),
+            written: 0,
+        }
+    }
+
+    /// Whether anybody listens, or may.
     pub(crate) fn enabled(&self) -> bool {
-        self.pipe.is_some()
+        self.pipe.is_some() || self.socket.is_some()
     }
 
     pub(crate) fn say(&mut self, status: &FederateStatus) {
@@ -90,8 +131,18 @@ impl Status {
 
     /// Whether somebody listens and reads.
     fn has_room(&mut self) -> bool {
+        self.look_for_listener();
         self.flush();
         self.pipe.is_some() && self.waiting.is_empty()
+    }
+
+    /// Finds somebody on the socket again.
+    fn look_for_listener(&mut self) {
+        if let (None, Some(socket)) = (&self.pipe, &mut self.socket)
+            && socket.again <= Instant::now()
+        {
+            self.pipe = socket.connect();
+        }
     }
 
     /// Writes a line if there is room now, and forgets it otherwise; a line that was begun is written to its end.
@@ -158,6 +209,7 @@ impl Status {
                 Err(_) => {
                     self.pipe = None;
                     self.waiting.clear();
+                    self.written = 0;
                     return;
                 }
             }
@@ -197,6 +249,30 @@ mod tests {
             }
         }
         measures
+    }
+
+    /// Who listens on the socket may come late, go away and come again.
+    #[test]
+    fn a_socket_is_found_whenever_somebody_listens() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("status");
+        let mut status = Status::to_socket(&path);
+        assert!(status.enabled());
+        status.say(&running());
+        for _ in 0..2 {
+            let listener = std::os::unix::net::UnixListener::bind(&path).unwrap();
+            // As if half a second had passed.
+            status.socket.as_mut().unwrap().again = std::time::Instant::now();
+            status.say_measures("x", &measures());
+            let (mut stream, _) = listener.accept().unwrap();
+            let mut byte = [0];
+            assert_eq!((stream.read(&mut byte).unwrap(), byte), (1, *b"{"));
+            drop((listener, stream));
+            std::fs::remove_file(&path).unwrap();
+            // The first write after that finds out.
+            status.say(&running());
+            assert!(status.pipe.is_none());
+        }
     }
 
     #[test]

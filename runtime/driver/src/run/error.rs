@@ -20,6 +20,12 @@ pub enum RunError {
         /// Why.
         source: io::Error,
     },
+    /// The variable of `--plan-env` is not set, or no text.
+    #[error("the environment variable {name} has no plan")]
+    NoPlan {
+        /// Its name.
+        name: String,
+    },
     /// The plan is not a plan.
     #[error("{} is not a plan: {source}", .path.display())]
     ParsePlan {
@@ -84,6 +90,7 @@ impl RunError {
             Self::Connect { .. } => exit::NOT_JOINED,
             Self::Clock(_) => exit::CLOCK,
             Self::ReadPlan { .. }
+            | Self::NoPlan { .. }
             | Self::ParsePlan { .. }
             | Self::Assembly(_)
             | Self::Observe(_)
