@@ -5,6 +5,7 @@
 
 mod deployments;
 mod hosts;
+mod network;
 mod operator;
 
 use ictus_tests::rig::{self, Rig, Snapshot};
@@ -19,7 +20,7 @@ const HOSTS: u8 = 3;
 type Scenario = (&'static str, fn(&Rig));
 
 /// Every scenario of these modules, in order.
-const SCENARIOS: &[&[Scenario]] = &[hosts::SCENARIOS, deployments::SCENARIOS];
+const SCENARIOS: &[&[Scenario]] = &[hosts::SCENARIOS, deployments::SCENARIOS, network::SCENARIOS];
 
 #[expect(clippy::print_stdout, reason = "a test's report")]
 fn main() -> ExitCode {

@@ -9,6 +9,7 @@ use ictusd::stamp;
 use serde::Serialize;
 
 use crate::error::{CliError, Kind};
+use crate::hosts::outcome::headline;
 use crate::hosts::{Clients, connect_all};
 use crate::session::{Abroad, Session, Whereabouts, ago};
 use crate::ui::{Table, Ui, nanoseconds, one_line};
@@ -173,7 +174,7 @@ impl<'a> Hosts<'a> {
             .collect();
         ui.result(&all.map_err(CliError::failed)?, || {
             let mut table = head();
-            for view in views {
+            for view in &views {
                 rows(&mut table, view);
             }
             for Unknown {
@@ -189,7 +190,12 @@ impl<'a> Hosts<'a> {
                     since(*since_ns),
                 ]);
             }
-            table.text()
+            let mut text = table.text();
+            if let Some(headline) = headline(&views) {
+                text.push('\n');
+                text.push_str(&headline);
+            }
+            text
         })?;
         for Unknown { host, why, .. } in silent {
             ui.warning(&format!("{host}: unknown: {why}"));

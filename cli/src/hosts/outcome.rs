@@ -7,6 +7,7 @@ use ictusd::api::{FederationView, Outcome};
 
 use super::Clients;
 use crate::error::CliError;
+use crate::ui::one_line;
 
 /// Asks every host how its part stands.
 pub(crate) async fn of_all(clients: &Clients, federation: &str) -> Result<Merged, CliError> {
@@ -85,4 +86,30 @@ pub(crate) fn succeed(name: &str, merged: &Merged) -> Result<(), CliError> {
             "federation `{name}` has not ended everywhere"
         ))),
     }
+}
+
+/// Of what the parts of one federation say went wrong, the cause: the rest are consequences. It names the host on which the
+/// member ran, whichever host says so.
+pub(crate) fn headline(views: &[&FederationView]) -> Option<String> {
+    let parts = views
+        .iter()
+        .filter_map(|view| Some((view, view.part.as_ref()?)));
+    let failures = parts.filter_map(|(view, part)| match &view.outcome {
+        Some(Outcome::Failed { failure, .. }) => Some((view, part, failure)),
+        Some(Outcome::Completed | Outcome::Stopped { .. } | Outcome::Aborted) | None => None,
+    });
+    let (view, part, failure) =
+        failures.min_by_key(|(_, part, failure)| (failure.rank, failure.at_ns, &part.host))?;
+    let ran = |view: &&&FederationView| {
+        let mut members = view.federates.iter().map(|member| &member.name);
+        members.any(|name| failure.member.as_ref() == Some(name))
+    };
+    let there = views.iter().find(ran).and_then(|view| view.part.as_ref());
+    let host = &there.unwrap_or(part).host;
+    let who = failure.member.as_deref().unwrap_or("federation");
+    let what = one_line(&failure.what);
+    let name = &view.name;
+    Some(format!(
+        "federation `{name}` failed: host `{host}`: {who}: {what}"
+    ))
 }
