@@ -11,6 +11,7 @@ mod hosts;
 mod interrupts;
 mod rollout;
 mod runs;
+mod secrets;
 mod session;
 mod ui;
 

@@ -17,6 +17,7 @@ use ictusd::blobs;
 
 use crate::error::{CliError, Kind};
 use crate::hosts::{Clients, connect_all, ways};
+use crate::secrets::Secrets;
 use crate::session::{Session, request};
 
 mod again;
@@ -45,6 +46,8 @@ pub(crate) struct Rollout<'a> {
     observed: ObservedHosts,
     /// The number that this run will have in the history.
     generation: u64,
+    /// The values of secrets, as far as they are known here.
+    pub(crate) secrets: Secrets,
 }
 
 impl<'a> Rollout<'a> {
@@ -68,7 +71,10 @@ impl<'a> Rollout<'a> {
             let blobs = host.map(|host| host.blobs.iter().map(|it| it.digest.clone()));
             blobs.into_iter().flatten().collect()
         };
-        let (clients, observed) = observe::all(connected, &desired.federation, &blobs).await;
+        let secrets = Secrets::read(&checked.federates);
+        let (clients, mut observed) = observe::all(connected, &desired.federation, &blobs).await;
+        let wanted = (&desired, &secrets.values);
+        observe::compare_secrets(&clients, &mut observed, wanted).await;
         let plan = plan(&desired, &observed).map_err(refused)?;
         let generation = next_generation(&clients, &desired.federation).await;
         Ok(Self {
@@ -81,6 +87,7 @@ impl<'a> Rollout<'a> {
             plan,
             observed,
             generation,
+            secrets,
         })
     }
 

@@ -205,7 +205,7 @@ impl Agent {
         match state {
             State::Running => agent.was_healthy = true,
             State::Prepared | State::Starting => agent.undo(now, Why::Aborted),
-            State::Stopping | State::Ended => {
+            State::Stopping | State::Ended | State::WaitingForSecrets => {
                 agent.was_healthy = true;
                 agent.begin_stop(now, Why::Requested);
             }

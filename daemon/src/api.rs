@@ -4,7 +4,7 @@
 //! |---|---|
 //! | `GET /v1/info` | [`Info`] |
 //! | `GET /v1/federations`, `GET /v1/federations/NAME` | [`FederationView`], a list of them |
-//! | `POST /v1/federations/NAME` with a [`StartRequest`] | a stream of [`Happening`], one a line, until the federation ends; closing it before `healthy` undoes the start |
+//! | `POST /v1/federations/NAME` with a [`secret::StartCall`] | a stream of [`Happening`], one a line, until the federation ends; closing it before `healthy` undoes the start |
 //! | `POST /v1/federations/NAME/stop?kill=BOOL` | the same stream until the end |
 //! | `DELETE /v1/federations/NAME?purge=BOOL&keep_history=BOOL` | [`Removed`], when nothing runs any more |
 //! | `GET /v1/federations/NAME/measures` | [`FederationMeasures`], until it is taken down |
@@ -30,6 +30,7 @@ use crate::supervisor::exit::Ending;
 
 pub mod part;
 pub mod recorded;
+pub mod secret;
 
 use part::Part;
 use recorded::Kept;
@@ -129,6 +130,8 @@ pub enum State {
     Stopping,
     /// Nothing runs any more; see the outcome.
     Ended,
+    /// Nothing runs: its secrets went with the host's memory when that was started again; the next `up` starts it.
+    WaitingForSecrets,
 }
 
 /// The RTI or a federate as it is.

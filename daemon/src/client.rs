@@ -22,6 +22,7 @@ use tokio::net::UnixStream;
 use tokio::task::JoinHandle;
 use tokio::time::timeout;
 
+use crate::api::secret::{SecretValues, StartCall};
 use crate::api::{
     ApiError, ErrorCode, FederationMeasures, FederationView, Happening, Info, LogLine, Removed,
     StartRequest,
@@ -247,7 +248,23 @@ impl Client {
         name: &str,
         request: &StartRequest,
     ) -> Result<Stream<Happening>, ClientError> {
-        let body = serde_json::to_vec(request).map_err(ClientError::NotUnderstood)?;
+        let call = StartCall {
+            request: request.clone(),
+            secrets: SecretValues::default(),
+        };
+        self.start_with(name, &call).await
+    }
+
+    /// The same with the values of its secrets.
+    ///
+    /// # Errors
+    /// As for [`Client::start`]; a value that is missing, or another one than that of the run that is there.
+    pub async fn start_with(
+        &self,
+        name: &str,
+        call: &StartCall,
+    ) -> Result<Stream<Happening>, ClientError> {
+        let body = serde_json::to_vec(call).map_err(ClientError::NotUnderstood)?;
         self.stream(Method::POST, &path(name, "", &[]), body.into())
             .await
     }

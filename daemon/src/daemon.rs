@@ -156,6 +156,8 @@ fn announce() -> Result<(), DaemonError> {
 fn clean(paths: &Paths) {
     if !paths.federations().exists() {
         files::remove(&paths.daemon_log()).ok();
+        // With the last record its MACs are gone.
+        files::remove(&paths.secrets_key()).ok();
     }
     for directory in [&paths.run, &paths.state] {
         // Fails when something is in it.

@@ -2,8 +2,12 @@
 
 use std::fs;
 
+use ictus_deploy::gives::Gives;
+
 use crate::api::part::{DockerFacts, HostFacts};
 use crate::paths::Paths;
+
+mod gives;
 
 /// Asks the system, but not the Docker engine.
 pub(crate) fn of_this_host(paths: &Paths, docker: Result<DockerFacts, String>) -> HostFacts {
@@ -20,10 +24,15 @@ pub(crate) fn of_this_host(paths: &Paths, docker: Result<DockerFacts, String>) -
         user: user(),
         cpus: u32::try_from(cpus).unwrap_or(u32::MAX),
         disk_free: disk.map_or(0, |disk| disk.f_bavail.saturating_mul(disk.f_frsize)),
-        realtime: realtime(),
+        gives: gives(paths),
         docker,
         starts_at_boot: false,
     }
+}
+
+/// What federates may need and it gives.
+pub(crate) fn gives(paths: &Paths) -> Gives {
+    gives::of_this_host(paths, &user())
 }
 
 /// The user's name; its number when there is none.
@@ -36,10 +45,4 @@ fn user() -> String {
         (fields.nth(1)? == uid).then(|| name.to_owned())
     });
     name.unwrap_or(uid)
-}
-
-/// Whether the limits allow a realtime priority. Root needs no limit, but a container's cgroup may still refuse it.
-fn realtime() -> bool {
-    let limit = rustix::process::getrlimit(rustix::process::Resource::Rtprio);
-    limit.current.is_none_or(|limit| limit > 0)
 }

@@ -16,6 +16,7 @@ use crate::api::{
 use crate::docker::ContainerSpec;
 use crate::identity::random_id;
 use crate::paths::Paths;
+use crate::secrets::{self, KeptSecrets};
 use crate::stamp;
 use crate::store::{Directory, Record, StoreError, Supervised};
 use crate::supervisor::log_path;
@@ -114,12 +115,13 @@ impl Federation {
     pub(crate) fn start(
         paths: &Paths,
         name: &str,
-        (request, metrics): (StartRequest, Option<SocketAddr>),
+        (request, metrics, secrets): (StartRequest, Option<SocketAddr>, Option<KeptSecrets>),
         told: broadcast::Sender<Happening>,
     ) -> Result<(Self, Handle), BeginError> {
         let id = random_id().map_err(BeginError::Random)?;
         let (directory, mut record) = Self::prepare(paths, name, &request, id)?;
         record.view.metrics = metrics;
+        record.secrets = secrets;
         Ok(Self::begin(paths, directory, (request, record, None), told))
     }
 
@@ -154,6 +156,7 @@ impl Federation {
             protocol: PROTOCOL,
             members: BTreeMap::new(),
             rti: None,
+            secrets: None,
             view,
         };
         Ok((directory, record))
@@ -267,6 +270,7 @@ impl Federation {
                 if undone {
                     self.undo().await;
                 }
+                self.remove_secrets();
                 return;
             }
             let timeout = self.agent.poll_timeout().map(|until| self.origin + until);
@@ -305,6 +309,16 @@ impl Federation {
         }
         if let Err(error) = self.directory.undo() {
             tracing::warn!(%error, "not everything was undone");
+        }
+    }
+
+    /// Nothing runs that could read them.
+    fn remove_secrets(&self) {
+        let (name, kept) = (&self.record.view.name, self.record.secrets.as_ref());
+        if kept.is_some()
+            && let Err(error) = secrets::remove(&self.paths, name, kept)
+        {
+            tracing::warn!(%error, "secrets were not removed");
         }
     }
 

@@ -5,7 +5,6 @@ use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
-use ictus_deploy::{Engine, FederateRun};
 use tokio::sync::{broadcast, watch};
 use tokio::time::Instant;
 
@@ -13,6 +12,7 @@ use crate::agent::RTI;
 use crate::api::{
     ApiError, ErrorCode, Failure, FailureKind, FederateMeasures, FederationMeasures,
     FederationView, Happening, MemberView, Outcome, Removed, StartRequest, State,
+    secret::{SecretValues, StartCall},
 };
 use crate::federation::container::Images;
 use crate::federation::{BeginError, Command, Federation, Handle};
@@ -21,10 +21,13 @@ use crate::metrics::{self, Snapshot};
 use crate::paths::Paths;
 use crate::scrape::Listeners;
 use crate::store::{self, Directory, Leave, Record, StoreError};
-use crate::{rescue, stamp};
+use crate::{rescue, secrets, stamp};
 
+mod needs;
 mod parts;
 mod recorded;
+
+pub(crate) use needs::account;
 
 /// Events that a slow follower may miss before it is disconnected.
 const EVENTS_MAX: usize = 4096;
@@ -76,6 +79,10 @@ impl Host {
                 Ok(Some(record)) if record.view.state == State::Prepared => {
                     tracing::info!(%name, run = record.view.id, "prepared, and not committed");
                 }
+                Ok(Some(record)) if record.view.state == State::WaitingForSecrets => {}
+                Ok(Some(record)) if lost_secrets(&record, &directory) => {
+                    self.wait_for_secrets(&directory, record);
+                }
                 Ok(Some(mut record)) if record.view.outcome.is_none() => {
                     record.view.metrics = self.listen_again(&name, &directory);
                     let told = self.0.told.clone();
@@ -87,7 +94,11 @@ impl Host {
                         Err(error) => tracing::error!(%name, %error, "not adopted"),
                     }
                 }
-                Ok(_) => {}
+                Ok(Some(_)) => {
+                    // A daemon that was killed at the end may have left them.
+                    self.remove_secrets(&name).ok();
+                }
+                Ok(None) => {}
                 Err(error) => tracing::error!(%name, %error, "not adopted"),
             }
         }
@@ -97,30 +108,76 @@ impl Host {
         }
     }
 
+    /// Nothing of the run lives, and it is not started again without its secrets.
+    fn wait_for_secrets(&self, directory: &Directory, mut record: Record) {
+        let name = record.view.name.clone();
+        tracing::info!(%name, "its secrets are gone with the host's memory; it waits for `ictus up`");
+        record.view.state = State::WaitingForSecrets;
+        for member in record
+            .view
+            .federates
+            .iter_mut()
+            .chain([&mut record.view.rti])
+        {
+            (member.state, member.pid) = ("waiting".to_owned(), None);
+        }
+        if let Err(error) = directory.write_record(&record) {
+            tracing::error!(%name, %error, "the record was not written");
+        }
+    }
+
     /// Begins a federation; every later event of it reaches `subscribe`d receivers.
-    pub(crate) fn start(&self, name: &str, request: StartRequest) -> Result<Handle, ApiError> {
+    pub(crate) fn start(&self, name: &str, call: StartCall) -> Result<Handle, ApiError> {
+        let StartCall { request, secrets } = call;
         validate(name, &request)?;
         self.check_fence(name, None)?;
-        if let Some(living) = self.living().get(name) {
-            let same = living.request == request;
-            let code = if same {
-                ErrorCode::AlreadyRunning
-            } else {
-                ErrorCode::Conflict
-            };
-            return Err(ApiError {
-                code,
-                message: format!("federation `{name}` is already running"),
-                known: Vec::new(),
-            });
+        if let Some(living) = self.handle(name) {
+            return Err(self.already_running(name, living.request == request, &secrets)?);
         }
         self.check_driven(name)?;
+        self.check_needs(&request)?;
         let metrics = self.listen(name, request.settings.metrics_listen)?;
+        let secrets = self.hand_over(name, &request, &secrets)?;
         let told = self.0.told.clone();
-        let (federation, handle) = Federation::start(&self.0.paths, name, (request, metrics), told)
-            .map_err(|error| begin_error(&error))?;
+        let users = request.clone();
+        let begun = Federation::start(&self.0.paths, name, (request, metrics, secrets), told);
+        let (federation, handle) = begun.map_err(|error| {
+            self.remove_secrets(name).ok();
+            begin_error(&error)
+        })?;
+        self.admit_users(&self.directory(name), &users)?;
         self.spawn(name.to_owned(), federation, handle.clone());
         Ok(handle)
+    }
+
+    /// What a start is told when the federation runs; `same` when its request is the same.
+    fn already_running(
+        &self,
+        name: &str,
+        same: bool,
+        secrets: &SecretValues,
+    ) -> Result<ApiError, ApiError> {
+        let changed = self.changed_secrets(name, secrets)?;
+        let changed = changed
+            .iter()
+            .find_map(|(federate, names)| Some((federate, names.first()?)));
+        let (code, message) = match changed {
+            Some((federate, secret)) => (
+                ErrorCode::Conflict,
+                format!(
+                    "federation `{name}` is already running, with another value of secret `{secret}` of federate `{federate}`"
+                ),
+            ),
+            None if same => (
+                ErrorCode::AlreadyRunning,
+                format!("federation `{name}` is already running"),
+            ),
+            None => (
+                ErrorCode::Conflict,
+                format!("federation `{name}` is already running"),
+            ),
+        };
+        Ok(error(code, message))
     }
 
     /// The federation of this name, if it lives.
@@ -246,6 +303,7 @@ impl Host {
         self.listeners().release(name);
         self.remove_containers(name, Images::Remove).await?;
         self.settle(name);
+        self.remove_secrets(name)?;
         let kept = self
             .directory(name)
             .remove(leave)
@@ -253,6 +311,10 @@ impl Host {
         if leave != Leave::Logs {
             // Only when it was the last one.
             std::fs::remove_dir(self.0.paths.federations()).ok();
+        }
+        if !self.0.paths.federations().exists() {
+            // With the last record its MACs are gone.
+            crate::files::remove(&self.0.paths.secrets_key()).ok();
         }
         self.collect_blobs();
         Ok(Removed { outcome, kept })
@@ -330,7 +392,8 @@ impl Host {
         let directory = self.directory(name);
         let why = match recorded(name, &directory) {
             Ok(Some(record))
-                if record.view.outcome.is_some() || record.view.state == State::Prepared =>
+                if record.view.outcome.is_some()
+                    || [State::Prepared, State::WaitingForSecrets].contains(&record.view.state) =>
             {
                 return Ok(());
             }
@@ -467,35 +530,17 @@ fn validate(name: &str, request: &StartRequest) -> Result<(), ApiError> {
         if run.id != id || !store::is_name(&run.name) || run.name == RTI {
             return Err(bad(format!("`{}` cannot be a federate's name", run.name)));
         }
-        if let Some(what) = not_given(request, run) {
-            let message = format!("federate `{}` needs {what}; leave it out", run.name);
-            return Err(bad(message));
-        }
     }
     Ok(())
 }
 
-/// What a federate needs and this version does not give it; better said than left out.
-fn not_given(request: &StartRequest, run: &FederateRun) -> Option<&'static str> {
-    let part = request.part.as_ref();
-    let contained = part.is_some_and(|part| part.engine == Engine::Docker);
-    let elsewhere = part.is_some_and(|part| !part.federates.contains(&run.id));
-    let needs = &run.needs;
-    if elsewhere {
-        None
-    } else if !needs.secrets.is_empty() {
-        Some("secrets, which this version does not hand over")
-    } else if needs.realtime.is_some() {
-        Some("realtime scheduling, which this version does not set")
-    } else if !contained && !needs.cpus.is_empty() {
-        Some(
-            "processors of its own, which this version gives only to containers (`engine: docker`)",
-        )
-    } else if !contained && needs.user.is_some() {
-        Some("another user, which this version gives only to containers (`engine: docker`)")
-    } else {
-        None
-    }
+/// Whether a run that has not ended lost its secrets with the host's memory: then nothing of it lives either.
+fn lost_secrets(record: &Record, directory: &Directory) -> bool {
+    let lost = |kept| !secrets::are_there(kept);
+    record.view.outcome.is_none()
+        && record.view.state != State::Prepared
+        && record.secrets.as_ref().is_some_and(lost)
+        && rescue::living(directory).is_empty()
 }
 
 fn begin_error(error: &BeginError) -> ApiError {
@@ -523,4 +568,16 @@ pub(crate) fn with_sources(error: &dyn std::error::Error) -> String {
         source = error.source();
     }
     text
+}
+
+fn error_of(message: String) -> ApiError {
+    error(ErrorCode::Failed, message)
+}
+
+fn error(code: ErrorCode, message: String) -> ApiError {
+    ApiError {
+        code,
+        message,
+        known: Vec::new(),
+    }
 }

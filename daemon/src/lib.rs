@@ -5,6 +5,7 @@
 //! - [`daemon`]: the process that owns federations and serves [`api`] on a Unix socket;
 //! - [`client`]: what the command line uses.
 
+pub mod accounts;
 pub mod agent;
 pub mod api;
 pub mod blobs;
@@ -24,6 +25,7 @@ pub mod paths;
 mod process;
 mod rescue;
 mod scrape;
+pub mod secrets;
 mod server;
 pub mod stamp;
 pub mod store;

@@ -185,6 +185,12 @@ impl Paths {
         self.state.join("leases.json")
     }
 
+    /// The key of this host's MACs of secrets.
+    #[must_use]
+    pub fn secrets_key(&self) -> PathBuf {
+        self.state.join("secrets.key")
+    }
+
     /// The on-demand daemon's own log.
     #[must_use]
     pub fn daemon_log(&self) -> PathBuf {

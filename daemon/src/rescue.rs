@@ -94,6 +94,7 @@ pub(crate) fn record(name: &str, directory: &Directory) -> Option<Record> {
         protocol: PROTOCOL,
         members,
         rti: rti_of(directory),
+        secrets: None,
         view,
     })
 }

@@ -19,9 +19,10 @@ use serde::{Deserialize, Serialize};
 use tokio::net::{UnixListener, UnixStream};
 use tokio::sync::{broadcast, mpsc};
 
+use crate::api::secret::StartCall;
 use crate::api::{
     ApiError, ErrorCode, Event, FederationMeasures, FederationView, Happening, Info, LogLine,
-    Removed, StartRequest, VERSION,
+    Removed, VERSION,
 };
 use crate::federation::Command;
 use crate::host::Host;
@@ -141,10 +142,10 @@ async fn start(
     Path(name): Path<String>,
     body: Bytes,
 ) -> Result<Response, ApiError> {
-    let request: StartRequest =
+    let call: StartCall =
         serde_json::from_slice(&body).map_err(|error| bad_request(&error.to_string()))?;
     let told = host.subscribe();
-    let handle = host.start(&name, request)?;
+    let handle = host.start(&name, call)?;
     let (lines, body) = JsonLines::new(Some(StarterGuard(handle.commands)));
     tokio::spawn(pass_until_end(told, name, lines));
     Ok(stream(body))

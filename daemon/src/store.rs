@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::fs::{self, DirBuilder, OpenOptions};
 use std::io::{self, Write};
 use std::net::SocketAddrV4;
-use std::os::unix::fs::DirBuilderExt;
+use std::os::unix::fs::{DirBuilderExt, PermissionsExt};
 use std::path::{Path, PathBuf};
 
 use ictus_coord::plan::Plan;
@@ -15,6 +15,7 @@ use crate::api::recorded::Kept;
 use crate::api::{FederationMeasures, FederationView, Happening, StartRequest};
 use crate::files;
 use crate::identity::ProcessIdentity;
+use crate::secrets::KeptSecrets;
 use crate::supervisor::spec::PROTOCOL;
 
 /// The longest federation or federate name.
@@ -36,6 +37,9 @@ pub struct Record {
     /// Where the RTI listens, when that is another host.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub rti: Option<SocketAddrV4>,
+    /// Where the run's secrets are, and their MACs.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub secrets: Option<KeptSecrets>,
     /// The federation as it was when the record was written.
     pub view: FederationView,
 }
@@ -224,7 +228,10 @@ impl Directory {
         }
         write(&self.plan(), &request.plan)?;
         write(&self.timing_spec(), &request.timing)?;
-        write(&self.request(), request)
+        write(&self.request(), request)?;
+        // Federates of other users come into the directory, but have no business with each other's environment.
+        let private = fs::Permissions::from_mode(0o600);
+        fs::set_permissions(self.request(), private).map_err(io_at(&self.request()))
     }
 
     /// Reads the plan, and what `ictus timing` is to print; they stay when a run is taken down.

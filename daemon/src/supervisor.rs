@@ -26,6 +26,7 @@ use crate::{files, stamp};
 mod control;
 pub mod exit;
 mod history;
+pub mod limits;
 mod lines;
 pub(crate) mod log;
 pub(crate) mod process;

@@ -11,6 +11,7 @@ pub mod compose;
 mod document;
 mod env_file;
 mod federation;
+pub mod gives;
 mod hosts;
 pub mod image;
 mod lets;

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::path::PathBuf;
 
 use crate::env_file::{self, is_variable};
-use crate::federation::Member;
+use crate::federation::{Member, Origin};
 use crate::hosts::{Outside, Seating};
 use crate::manifest::{Secret, VolumeText};
 use crate::placement::{Engine, Needs, Realtime, SecretSource, Volume};
@@ -13,7 +13,7 @@ use crate::problem::{Place, Report};
 /// The least memory that the docker engine accepts, in bytes.
 const LEAST_MEMORY: u64 = 6 << 20;
 /// Where containers have what is ours.
-const OURS: [&str; 3] = ["/ictus", "/.ictus", "/app"];
+const OURS: [&str; 4] = ["/ictus", "/.ictus", "/app", "/run/secrets"];
 
 /// What a federate is given besides its program.
 #[derive(Clone, Debug, Default)]
@@ -61,6 +61,13 @@ fn outfit(member: &Member<'_>, outside: &Outside<'_>, report: &mut Report) -> Ou
         let message = format!("`{image}` is no name of an image");
         let fix = "write it as `registry/name:tag`";
         report.add("F036", Place::value(&at("image")), message, fix);
+    }
+    let locked = federate.realtime.is_some_and(|it| it.lock_memory);
+    if locked && matches!(member.origin, Origin::Foreign { .. }) {
+        let message = "a prebuilt federate cannot be told to lock its memory";
+        let place = ["federates", member.name, "realtime", "lock_memory"];
+        let fix = "leave it out: only programs of Ictus lock their own";
+        report.add("F036", Place::value(&place), message, fix);
     }
     let realtime = federate.realtime.and_then(|realtime| {
         Some(Realtime {

@@ -4,6 +4,7 @@ use std::io::{IsTerminal, Write};
 use std::path::{Path, PathBuf};
 
 use clap::{Args, Subcommand};
+use ictus_deploy::gives::{Denied, Gives, ranges};
 use ictus_deploy::image::elf::{Architecture, Machine};
 use ictus_deploy::placement::{SshClient, Way};
 use ictus_deploy::ssh::{Connection, HostKey, SshError, Target, host_keys, pin};
@@ -301,16 +302,47 @@ fn show(ui: &mut Ui, host: &str, facts: &HostFacts) -> Result<(), CliError> {
             Err(why) => format!("no Docker: {why}"),
         };
         format!(
-            "{host}: {} as {}, ictusd {}\n  {} with {} processors, Linux {}, {} free\n  {docker}\n  realtime scheduling: {}\n  starts at boot: {}",
+            "{host}: {} as {}, ictusd {}\n  {} with {} processors ({}), Linux {}, {} free\n  {docker}\n{}\n  starts at boot: {}",
             facts.hostname,
             facts.user,
             facts.version,
             facts.arch,
             facts.cpus,
+            ranges(&facts.gives.cpus),
             facts.kernel,
             size(facts.disk_free),
-            yes(facts.realtime),
+            given(&facts.gives),
             yes(facts.starts_at_boot),
         )
     })
+}
+
+/// What federates may need: a line each, with the reason and the fix when they do not get it.
+fn given(gives: &Gives) -> String {
+    let line = |what: &str, given: Result<String, &Denied>| match given {
+        Ok(given) => format!("  {what}: {given}"),
+        Err(Denied { why, fix }) => format!("  {what}: no: {why}; {fix}"),
+    };
+    let priority = |highest: &u8| format!("up to priority {highest}");
+    let others = match gives.uid {
+        0 => "yes, it is root".to_owned(),
+        uid => format!("in containers only: its daemon runs as user {uid}"),
+    };
+    let (processes, containers) = (gives.realtime.as_ref(), gives.realtime_contained.as_ref());
+    let locked = gives.lock_memory.as_ref().map(|()| "yes".to_owned());
+    let secrets = gives.secrets.as_ref();
+    [
+        line("realtime scheduling", processes.map(priority)),
+        line(
+            "realtime scheduling of containers",
+            containers.map(priority),
+        ),
+        line("locked memory", locked),
+        line(
+            "secrets",
+            secrets.map(|path| format!("in {}", path.display())),
+        ),
+        format!("  federates as other users: {others}"),
+    ]
+    .join("\n")
 }

@@ -62,6 +62,9 @@ impl PlanCommand {
         let session = Session::new()?;
         let rollout = Rollout::new(&session, &checked, placement, self.trace);
         let rollout = session.block_on(rollout)?;
+        for missing in &rollout.secrets.missing {
+            ui.warning(&format!("{missing}; not compared, and `ictus up` needs it"));
+        }
         if let Some(out) = &self.out {
             rollout.saved(&self.manifest.set).write(out)?;
             ui.stage("saved", &out.display().to_string());

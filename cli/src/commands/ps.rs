@@ -304,6 +304,7 @@ fn state(view: &FederationView) -> String {
             format!("failed: {who}: {}", one_line(&failure.what))
         }
         (None, State::Prepared) => "prepared".to_owned(),
+        (None, State::WaitingForSecrets) => "waiting for secrets".to_owned(),
         (None, State::Starting) => "starting".to_owned(),
         (None, State::Running) => "running".to_owned(),
         (None, State::Stopping) => "stopping".to_owned(),

@@ -5,6 +5,7 @@ use std::time::{Duration, Instant};
 
 use clap::Args;
 use ictus_deploy::{Checked, Placement};
+use ictusd::api::secret::StartCall;
 use ictusd::api::{ErrorCode, Event, Happening, Outcome};
 use ictusd::client::{Client, ClientError, Stream, is_already_running};
 use ictusd::stamp;
@@ -15,6 +16,7 @@ use crate::args::{ManifestArgs, duration};
 use crate::error::{CliError, Kind};
 use crate::interrupts::Interrupts;
 use crate::rollout::{Executor, Rollout, SavedPlan, size};
+use crate::secrets::Secrets;
 use crate::session::{Session, checked, count, request, succeed};
 use crate::ui::Ui;
 
@@ -75,13 +77,16 @@ impl Up {
             let work = self.roll_out(ui, &session, (&checked, placement), None);
             return session.block_on(work);
         }
-        let request = request(&checked, self.trace);
+        let call = StartCall {
+            request: request(&checked, self.trace),
+            secrets: Secrets::read(&checked.federates).complete()?,
+        };
         let name = checked.plan.federation.clone();
         session.block_on(async {
             let interrupts = Interrupts::new()?;
             let client = session.daemon().await?;
             let timing = !checked.timing.is_empty();
-            let stream = match client.start(&name, &request).await {
+            let stream = match client.start_with(&name, &call).await {
                 Ok(stream) => stream,
                 Err(error) if is_already_running(&error) => {
                     ui.message(&format!("{name} is already running from the same plan"));
@@ -151,6 +156,8 @@ impl Up {
             let message = "`--attach` is for federations of this machine";
             return Err(CliError::failed(message).hint("`ictus logs -f` shows what they say"));
         }
+        // Before anybody is asked for anything.
+        Secrets::read(&checked.federates).complete()?;
         let since = Instant::now();
         let mut interrupts = Interrupts::new()?;
         let trace = saved.as_ref().map_or(self.trace, |saved| saved.trace);

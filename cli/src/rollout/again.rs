@@ -5,12 +5,14 @@ use std::net::Ipv4Addr;
 
 use ictus_deploy::placement::Way;
 use ictus_deploy::rollout::{Desired, DesiredHost, Plan, plan};
+use ictus_deploy::{FederateRun, Needs};
 use ictusd::api::part::{Part, PrepareRequest};
 use ictusd::api::recorded::Generation;
 
 use super::{ObservedHosts, next_generation, observe, refused};
 use crate::error::CliError;
 use crate::hosts::{Clients, connect_all};
+use crate::secrets::Secrets;
 use crate::session::Session;
 
 /// A plan that brings a generation back, and what its hosts are asked to prepare.
@@ -74,11 +76,12 @@ impl Again {
         });
         let requests = generations
             .into_iter()
-            .filter_map(|(host, it)| Some((host, prepare(it, number)?)));
+            .map(|(host, it)| Ok(prepare(it, number)?.map(|it| (host, it))));
+        let requests = requests.collect::<Result<Vec<_>, CliError>>()?;
         Ok(Self {
             plan,
             clients,
-            requests: requests.collect(),
+            requests: requests.into_iter().flatten().collect(),
             rti,
             federates: desired.federates(),
         })
@@ -98,15 +101,23 @@ fn ways_of(generation: &Generation) -> Vec<(String, Way)> {
         .collect()
 }
 
-fn prepare(generation: Generation, number: u64) -> Option<PrepareRequest> {
-    Some(PrepareRequest {
+fn prepare(generation: Generation, number: u64) -> Result<Option<PrepareRequest>, CliError> {
+    // Values are not kept with a generation: they are those of now, from where they came then.
+    let request = generation.request.as_ref();
+    let part = request.and_then(|request| request.part.as_ref());
+    let here = |run: &&FederateRun| part.is_some_and(|part| part.federates.contains(&run.id));
+    let runs = request.into_iter().flat_map(|request| &request.federates);
+    let secrets = Secrets::read(runs.filter(here)).complete()?;
+    let request = generation.request;
+    Ok(request.map(|request| PrepareRequest {
         previous: None,
         id: String::new(),
         digest: generation.view.digest,
         facets: generation.facets,
         generation: Some(number),
-        request: generation.request?,
-    })
+        request,
+        secrets,
+    }))
 }
 
 /// What was asked for when the generation was made, by what its hosts have kept.
@@ -139,11 +150,13 @@ fn desired(
             );
             return Err(CliError::failed(what).hint("`ictus up` with the manifest of then"));
         }
-        let realtime = runs.iter().filter(|run| run.needs.realtime.is_some());
+        let needs = runs.iter().filter(|run| run.needs != Needs::default());
         let wanted = DesiredHost {
             engine: part.engine,
             rti: part.rti,
-            realtime: realtime.map(|run| run.name.clone()).collect(),
+            needs: needs
+                .map(|run| (run.name.clone(), run.needs.clone()))
+                .collect(),
             federates: runs.iter().map(|run| run.name.clone()).collect(),
             // They are there: that was asked.
             blobs: Vec::new(),

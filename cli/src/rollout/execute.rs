@@ -102,10 +102,11 @@ enum Effect {
 
 impl Executor {
     /// Carries out what starts a federation.
-    pub(crate) fn up(rollout: Rollout<'_>) -> Result<Self, CliError> {
+    pub(crate) fn up(mut rollout: Rollout<'_>) -> Result<Self, CliError> {
         let run = identity::random_id().map_err(CliError::failed)?;
+        let secrets = std::mem::take(&mut rollout.secrets).complete()?;
         let mut requests = BTreeMap::new();
-        for host in rollout.desired.hosts.keys() {
+        for (host, wanted) in &rollout.desired.hosts {
             let previous = None;
             let Some(request) = rollout.part_request(host) else {
                 continue;
@@ -117,6 +118,7 @@ impl Executor {
                 facets: rollout.desired.facets.clone(),
                 generation: Some(rollout.generation),
                 request,
+                secrets: secrets.only(&wanted.federates),
             };
             requests.insert(host.clone(), prepare);
         }

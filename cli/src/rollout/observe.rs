@@ -2,7 +2,10 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use ictus_deploy::rollout::{Held, MemberState, NewerRecord, Observed, Reached, Run, RunState};
+use ictus_deploy::rollout::{
+    Desired, Held, MemberState, NewerRecord, Observed, Reached, Run, RunState,
+};
+use ictusd::api::secret::SecretValues;
 use ictusd::api::{ErrorCode, ExitReason, FederationView, MemberView, Outcome, State};
 use ictusd::client::{Client, ClientError};
 
@@ -41,6 +44,33 @@ pub(super) async fn all(
     (clients, observed)
 }
 
+/// Asks each host with a run which values of its federates' secrets are others than the run's.
+pub(super) async fn compare_secrets(
+    clients: &Clients,
+    observed: &mut ObservedHosts,
+    (desired, values): (&Desired, &SecretValues),
+) {
+    let asked = observed.iter_mut().map(|(host, observed)| async move {
+        let has_run = observed.run().is_some();
+        let (Observed::Reached(reached), Some(wanted)) = (&mut *observed, desired.hosts.get(host))
+        else {
+            return;
+        };
+        let values = values.only(&wanted.federates);
+        let Some(client) = clients.get(host).filter(|_| has_run && !values.is_empty()) else {
+            return;
+        };
+        match client.changed_secrets(&desired.federation, &values).await {
+            Ok(changed) => reached.secrets_changed = changed,
+            Err(error) => {
+                let why = CliError::from(error).to_string();
+                *observed = Observed::Unreachable { why };
+            }
+        }
+    });
+    futures_util::future::join_all(asked).await;
+}
+
 async fn one(
     client: &Client,
     federation: &str,
@@ -54,7 +84,8 @@ async fn one(
         version: facts.version,
         arch: facts.arch,
         docker: facts.docker.map(drop),
-        realtime: facts.realtime,
+        gives: facts.gives,
+        secrets_changed: BTreeMap::new(),
         disk_free: facts.disk_free,
         blobs: blobs
             .into_iter()
@@ -123,6 +154,9 @@ fn state(view: &FederationView) -> RunState {
         (State::Starting, None) => RunState::Starting,
         (State::Running, None) => RunState::Running,
         (State::Stopping, None) => RunState::Stopping,
+        (State::WaitingForSecrets, None) => RunState::Ended {
+            how: "the host was started again, and it waits for secrets".to_owned(),
+        },
         (State::Ended, None) => RunState::Ended {
             how: "ended".to_owned(),
         },

@@ -15,10 +15,12 @@
 use std::collections::BTreeMap;
 use std::net::{Ipv4Addr, SocketAddrV4};
 
+use ictus_deploy::gives::Gives;
 use ictus_deploy::placement::{Engine, PortRange, Way};
 use serde::{Deserialize, Serialize};
 
 use super::StartRequest;
+use super::secret::SecretValues;
 
 /// What runs on this host of a federation over several.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -71,6 +73,9 @@ pub struct PrepareRequest {
     pub generation: Option<u64>,
     /// What to run; has a part.
     pub request: StartRequest,
+    /// The values of the secrets of this host's federates; not kept with the request.
+    #[serde(default, skip_serializing_if = "SecretValues::is_empty")]
+    pub secrets: SecretValues,
 }
 
 /// A part that waits for its commit.
@@ -143,8 +148,9 @@ pub struct HostFacts {
     pub cpus: u32,
     /// Free bytes where state is kept.
     pub disk_free: u64,
-    /// Whether this user may ask for realtime scheduling.
-    pub realtime: bool,
+    /// What federates may need and it gives.
+    #[serde(default)]
+    pub gives: Gives,
     /// The Docker engine, or why there is none that can be used, with the fix.
     pub docker: Result<DockerFacts, String>,
     /// Whether systemd starts the daemon again after a reboot.

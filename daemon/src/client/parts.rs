@@ -20,6 +20,7 @@ use super::{Client, ClientError, Stream, encode, path, whole};
 use crate::api::part::{
     CommitRequest, HostFacts, Lease, LeaseRequest, LeaseView, PrepareRequest, Prepared,
 };
+use crate::api::secret::{SecretValues, SecretsChanged};
 use crate::api::{Happening, Removed};
 
 /// How long a host may take to prepare a part, or to write down a blob after its last byte.
@@ -141,6 +142,19 @@ impl Client {
         let (response, _connection) = self.exchange((Method::PUT, &path), body, limit).await?;
         let bytes = whole(response).await?;
         serde_json::from_slice(&bytes).map_err(ClientError::NotUnderstood)
+    }
+
+    /// Which of these values are others than the run's; the host learns nothing that it does not hold or is not given.
+    ///
+    /// # Errors
+    /// See [`ClientError`].
+    pub async fn changed_secrets(
+        &self,
+        name: &str,
+        values: &SecretValues,
+    ) -> Result<SecretsChanged, ClientError> {
+        let path = path(name, "/secrets", &[]);
+        self.answer(Method::POST, &path, json(values)?).await
     }
 
     /// Begins what was prepared. Dropping the stream before `healthy` undoes the part.

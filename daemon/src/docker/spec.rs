@@ -102,6 +102,7 @@ impl ContainerSpec {
         if let Some(realtime) = needs.realtime {
             self.realtime = Some(realtime.priority);
             self.lock_memory = realtime.lock_memory;
+            self.capabilities.push("SYS_NICE".to_owned());
         }
     }
 
@@ -274,6 +275,7 @@ mod tests {
             (Some(64 << 20), Some(64 << 20))
         );
         assert_eq!(host.pids_limit, Some(30));
+        assert_eq!(host.cap_add, Some(vec!["SYS_NICE".to_owned()]));
         let limits: Vec<_> = host
             .ulimits
             .unwrap()

@@ -21,6 +21,7 @@ use crate::agent::{MemberId, RTI};
 use crate::docker::{Binding, Container, ContainerSpec, Engine, EngineError, label};
 use crate::files;
 use crate::identity::ProcessIdentity;
+use crate::secrets;
 use crate::store::{Record, Supervised};
 use crate::supervisor::spec::Spec;
 
@@ -48,6 +49,8 @@ pub(crate) struct Contained {
     needs: Needs,
     /// Files that the member reads.
     files: Vec<PathBuf>,
+    /// The directory of its secrets, if it has any.
+    secrets: Option<PathBuf>,
     /// Directories that the member writes.
     directories: Vec<PathBuf>,
     /// The directory of its socket, which is its alone.
@@ -144,6 +147,12 @@ impl Contained {
             needs: federate
                 .map(|federate| federate.needs.clone())
                 .unwrap_or_default(),
+            secrets: federate
+                .filter(|federate| !federate.needs.secrets.is_empty())
+                .and_then(|federate| {
+                    let kept = run.record.secrets.as_ref()?;
+                    Some(secrets::directory(kept, &federate.name))
+                }),
             files: vec![run.directory.plan(), run.directory.spec(member_name)],
             directories,
             socket_directory: supervised
@@ -260,6 +269,11 @@ impl Contained {
             read_only: true,
         }];
         mounts.extend(self.files.iter().map(|path| Binding::same(path, true)));
+        mounts.extend(self.secrets.iter().map(|path| Binding {
+            host: path.clone(),
+            inside: secrets::INSIDE.into(),
+            read_only: true,
+        }));
         let directories = self.directories.iter().chain([&self.socket_directory]);
         mounts.extend(directories.map(|path| Binding::same(path, false)));
         let mut container = ContainerSpec {

@@ -5,13 +5,16 @@ use std::net::{Ipv4Addr, SocketAddrV4};
 use std::path::{Path, PathBuf};
 
 use ictus_coord::plan::{ClockSync, OnFailure, Wire};
-use ictus_deploy::{FederateKind, FederateRun};
+use ictus_deploy::{Engine, FederateKind, FederateRun};
 
 use crate::agent::{MemberId, RTI};
 use crate::api::StartRequest;
 use crate::api::part::Part;
+use crate::host::account;
 use crate::paths::Paths;
+use crate::secrets;
 use crate::store::{Directory, Record, Supervised};
+use crate::supervisor::limits::Limits;
 use crate::supervisor::log_path;
 use crate::supervisor::process::own_executable;
 use crate::supervisor::spec::{PROTOCOL, Spec};
@@ -50,6 +53,7 @@ pub(crate) fn spec(
     };
     let (program, args) = if let Some(federate) = federate {
         env.extend(federate.env.clone());
+        env.extend(run.secret_files(federate, supervised.container.is_some()));
         (
             run.executable(federate),
             run.federate_args(federate, run.rti(rti_port)),
@@ -68,6 +72,7 @@ pub(crate) fn spec(
         args,
         env,
         cwd,
+        limits: federate.map(|it| run.limits(it)).unwrap_or_default(),
         status: federate.is_none_or(|run| run.kind == FederateKind::Ours),
         log: log_path(&directory.logs(), &name),
         log_size_max: request.settings.log_max_size,
@@ -111,6 +116,34 @@ impl Run<'_> {
         )
     }
 
+    /// The variables that name the files of a federate's secrets.
+    fn secret_files(&self, federate: &FederateRun, contained: bool) -> BTreeMap<String, String> {
+        let kept = self.record.secrets.as_ref();
+        let names = federate.needs.secrets.keys();
+        let files = names.filter_map(|name| {
+            let file = secrets::file(kept?, &federate.name, name, contained);
+            Some((format!("{name}_FILE"), file.to_string_lossy().into_owned()))
+        });
+        files.collect()
+    }
+
+    /// What a federate is bound to before its program is executed; the rest is its container's.
+    fn limits(&self, federate: &FederateRun) -> Limits {
+        let needs = &federate.needs;
+        let part = self.request.part.as_ref();
+        let contained = part.is_some_and(|part| part.engine == Engine::Docker);
+        let account = account(self.request, federate).ok().flatten();
+        Limits {
+            cpus: match contained {
+                true => Vec::new(),
+                false => needs.cpus.clone(),
+            },
+            realtime: needs.realtime,
+            account: account.filter(|_| !contained),
+            no_core: !needs.secrets.is_empty(),
+        }
+    }
+
     fn rti_args(&self) -> Vec<String> {
         let request = self.request;
         let mut args = rti_args(request, &self.record.view.id, self.record.view.rti_port);
@@ -135,6 +168,9 @@ impl Run<'_> {
                 let mut args = vec!["--plan", &plan, "--federate", &run.name];
                 args.extend(["--rti", &rti, "-i", id, "--timing", &timing]);
                 let mut args: Vec<_> = args.into_iter().map(str::to_owned).collect();
+                if run.needs.realtime.is_some_and(|it| it.lock_memory) {
+                    args.push("--lock-memory".to_owned());
+                }
                 if let Some(part) = &self.request.part {
                     args.extend(["--data-address".to_owned(), part.address.to_string()]);
                     args.extend(["--allow".to_owned(), allowed(part)]);

@@ -16,10 +16,11 @@ use crate::federation::launch::Run;
 use crate::federation::{Federation, Handle, container};
 use crate::files;
 use crate::leases::{LeaseError, Leases};
+use crate::secrets;
 use crate::stamp;
 use crate::store::{self, StoreError};
 
-use super::{Host, recorded, store_error, validate, with_sources};
+use super::{Host, error, error_of, recorded, store_error, validate, with_sources};
 
 impl Host {
     /// Takes over what an earlier daemon kept of leases.
@@ -126,14 +127,21 @@ impl Host {
             let what = format!("program {missing} was not sent");
             return Err(error(ErrorCode::Failed, what));
         }
+        self.check_needs(request)?;
         let rti_port = part
             .rti
             .then(|| free_port(part, request.settings.rti_port))
             .transpose()?;
         self.settle(name);
         let id = prepare.id.clone();
+        let secrets = self.hand_over(name, request, &prepare.secrets)?;
         let prepared = Federation::prepare(self.paths(), name, request, id);
-        let (directory, mut record) = prepared.map_err(|error| store_error(&error))?;
+        let (directory, mut record) = prepared.map_err(|error| {
+            self.remove_secrets(name).ok();
+            store_error(&error)
+        })?;
+        record.secrets = secrets;
+        self.admit_users(&directory, request)?;
         record.view.rti_port = rti_port.flatten();
         record.view.digest.clone_from(&prepare.digest);
         record.view.facets.clone_from(&prepare.facets);
@@ -220,6 +228,17 @@ impl Host {
         let request = directory
             .read_request()
             .map_err(|error| store_error(&error))?;
+        if let Some(kept) = record
+            .secrets
+            .as_ref()
+            .filter(|kept| !secrets::are_there(kept))
+        {
+            let what = format!(
+                "federation `{name}` waits for secrets: {} is empty since the host was started again; `ictus up` sends them",
+                kept.directory.display()
+            );
+            return Err(error(ErrorCode::Failed, what));
+        }
         if let (Some(part), Some(port)) = (&request.part, record.view.rti_port) {
             // Somebody may have taken it since.
             bind(part.address, port).map_err(|why| taken(part, port, &why))?;
@@ -333,16 +352,4 @@ fn blob_error(blob: &BlobError) -> ApiError {
         BlobError::Io { .. } => ErrorCode::Failed,
     };
     error(code, with_sources(blob))
-}
-
-fn error_of(message: String) -> ApiError {
-    error(ErrorCode::Failed, message)
-}
-
-fn error(code: ErrorCode, message: String) -> ApiError {
-    ApiError {
-        code,
-        message,
-        known: Vec::new(),
-    }
 }

@@ -15,6 +15,7 @@ use tokio::sync::mpsc;
 use crate::api::part::{
     CommitRequest, HostFacts, Lease, LeaseRequest, LeaseView, PrepareRequest, Prepared,
 };
+use crate::api::secret::{SecretValues, SecretsChanged};
 use crate::api::{ApiError, ErrorCode};
 use crate::docker::Engine;
 use crate::facts;
@@ -38,6 +39,7 @@ pub(super) fn router() -> Router<Host> {
         .route("/v1/blobs", post(missing))
         .route("/v1/blobs/{digest}", blob)
         .route("/v1/federations/{name}/commit", post(commit))
+        .route("/v1/federations/{name}/secrets", post(changed_secrets))
 }
 
 #[derive(Deserialize)]
@@ -178,6 +180,16 @@ pub(super) async fn prepare(
     // Afterwards, because only then everything that it needs is known to be there.
     host.prepare_images(&name).await?;
     Ok(Json(prepared))
+}
+
+async fn changed_secrets(
+    State(host): State<Host>,
+    Path(name): Path<String>,
+    body: Bytes,
+) -> Result<Json<SecretsChanged>, ApiError> {
+    let values: SecretValues = parse(&body)?;
+    host.known_directory(&name)?;
+    host.changed_secrets(&name, &values).map(Json)
 }
 
 async fn commit(

@@ -38,7 +38,9 @@ impl Process {
     /// The reason in words when it is not.
     pub(crate) fn start(spec: &Spec) -> Result<Self, String> {
         let said = |what: &'static str| move |error: io::Error| format!("{what}: {error}");
-        let (mut command, status) = command(spec).map_err(said("cannot prepare its pipes"))?;
+        let limits = serde_json::to_string(&spec.limits).map_err(|error| error.to_string())?;
+        let prepared = command(spec, &limits).map_err(said("cannot prepare its pipes"));
+        let (mut command, status) = prepared?;
         let (report, report_ours) = pipe_with(PipeFlags::CLOEXEC)
             .map_err(|error| format!("cannot make a pipe: {error}"))?;
         command.stdin(Stdio::from(report_ours));
@@ -97,13 +99,14 @@ impl Process {
 /// A pipe for statuses: our end and theirs.
 type StatusPipe = Option<(OwnedFd, OwnedFd)>;
 
-fn command(spec: &Spec) -> io::Result<(Command, StatusPipe)> {
+fn command(spec: &Spec, limits: &str) -> io::Result<(Command, StatusPipe)> {
     let mut command = Command::new(own_executable());
     command
         .arg0("ictus")
         .args([
             OsStr::new(shim::COMMAND),
             OsStr::new(&std::process::id().to_string()),
+            OsStr::new(limits),
         ])
         .arg(&spec.program)
         .args(&spec.args)

@@ -7,6 +7,8 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
+use super::limits::Limits;
+
 /// The version of the spec, of the control protocol and of the exit record.
 pub const PROTOCOL: u32 = 1;
 
@@ -28,6 +30,9 @@ pub struct Spec {
     pub env: BTreeMap<String, String>,
     /// Its working directory.
     pub cwd: PathBuf,
+    /// What it is bound to.
+    #[serde(default, skip_serializing_if = "Limits::is_empty")]
+    pub limits: Limits,
     /// Whether to give it a status pipe and add `--status-fd N` to its arguments.
     pub status: bool,
     /// The log file; older ones get `.1`, `.2`, ... appended.

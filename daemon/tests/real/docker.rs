@@ -14,6 +14,7 @@ use std::thread;
 use ictus_deploy::image::elf::Machine;
 use ictus_deploy::{Engine, Needs};
 use ictusd::api::part::{CommitRequest, HostRef, LeaseRequest, Part, PrepareRequest};
+use ictusd::api::secret::SecretValues;
 use ictusd::api::{Event, Failure, FailureKind, Outcome, StartRequest, State};
 use ictusd::identity::random_id;
 
@@ -437,6 +438,7 @@ async fn images_are_made_before_anything_runs() {
         facets: BTreeMap::new(),
         generation: None,
         request: rig.request(&[("a", ""), ("b", "")]),
+        secrets: SecretValues::default(),
     };
     prepare.request.federates[1].needs.image = Some("no-such-image:1".to_owned());
     let refused = world.client.prepare((name, fence), &prepare).await;

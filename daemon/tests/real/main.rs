@@ -12,6 +12,7 @@
 mod daemon;
 mod docker;
 mod metrics;
+mod needs;
 mod parts;
 mod supervisor;
 mod world;

@@ -8,6 +8,7 @@ use std::sync::atomic::AtomicU64;
 use ictus_deploy::Engine;
 use ictus_deploy::placement::{PortRange, Way};
 use ictusd::api::part::{CommitRequest, HostRef, LeaseRequest, Part, PrepareRequest};
+use ictusd::api::secret::SecretValues;
 use ictusd::api::{ErrorCode, Event, ExitReason, Outcome, StartRequest, State};
 use ictusd::client::ClientError;
 
@@ -51,6 +52,7 @@ fn prepare(request: StartRequest, previous: Option<&str>) -> PrepareRequest {
         facets: BTreeMap::new(),
         generation: None,
         request,
+        secrets: SecretValues::default(),
     }
 }
 

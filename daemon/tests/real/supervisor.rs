@@ -7,6 +7,7 @@ use std::process::{Child, Command, Stdio};
 
 use ictusd::supervisor::READY;
 use ictusd::supervisor::exit::{Ending, ExitRecord};
+use ictusd::supervisor::limits::Limits;
 use ictusd::supervisor::protocol::{Reply, Request, StopSignal};
 use ictusd::supervisor::spec::{PROTOCOL, Spec};
 use tempfile::TempDir;
@@ -31,6 +32,7 @@ impl Supervised {
         let directory = tempfile::tempdir().unwrap();
         let at = |name: &str| directory.path().join(name);
         let mut spec = Spec {
+            limits: Limits::default(),
             protocol: PROTOCOL,
             instance: "the instance".to_owned(),
             name: "a".to_owned(),

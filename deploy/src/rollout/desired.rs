@@ -10,7 +10,7 @@ use serde_json::{Value, json};
 use sha2::{Digest, Sha256};
 
 use crate::check::{Checked, FederateRun, Settings};
-use crate::placement::{Engine, HostSpec, Placement, Way};
+use crate::placement::{Engine, HostSpec, Needs, Placement, SecretSource, Way};
 
 /// Hexadecimal digits of a facet's digest: enough to tell two apart, few enough to keep with every record.
 const FACET_DIGITS: usize = 16;
@@ -50,8 +50,8 @@ pub struct DesiredHost {
     pub rti: bool,
     /// Its federates, in the plan's order.
     pub federates: Vec<String>,
-    /// Those that need realtime scheduling.
-    pub realtime: Vec<String>,
+    /// What its federates need from it, by name; those without needs are missing.
+    pub needs: BTreeMap<String, Needs>,
     /// The program files that have to be there, by digest; empty for this machine.
     pub blobs: Vec<Blob>,
 }
@@ -190,12 +190,14 @@ fn hosts(
             all.filter(move |(_, host)| **host == index)
                 .map(|(run, _)| run)
         };
-        let realtime = runs().filter(|run| run.needs.realtime.is_some());
+        let needs = runs().filter(|run| run.needs != Needs::default());
         let host = DesiredHost {
             engine: spec.engine,
             rti: placement.rti == index,
             federates: runs().map(|run| run.name.clone()).collect(),
-            realtime: realtime.map(|run| run.name.clone()).collect(),
+            needs: needs
+                .map(|run| (run.name.clone(), without_sources(&run.needs)))
+                .collect(),
             blobs: match spec.way {
                 Way::Local => Vec::new(),
                 Way::Ssh { .. } => blobs(runs(), files),
@@ -204,6 +206,15 @@ fn hosts(
         (spec.name.clone(), host)
     };
     placement.hosts.iter().enumerate().map(host).collect()
+}
+
+/// Where a secret's value comes from is the operator's business.
+fn without_sources(needs: &Needs) -> Needs {
+    let mut needs = needs.clone();
+    for source in needs.secrets.values_mut() {
+        *source = SecretSource::Environment;
+    }
+    needs
 }
 
 /// One for each program, however many execute it.

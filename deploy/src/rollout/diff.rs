@@ -3,7 +3,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use super::desired::Desired;
-use super::observed::{MemberState, Observed, Run, RunState};
+use super::observed::{MemberState, Observed, Reached, Run, RunState};
 
 /// Why the federation has to be started or restarted; empty when it runs exactly as asked for, and nothing else does.
 pub(super) fn changes(desired: &Desired, observed: &BTreeMap<String, Observed>) -> Vec<String> {
@@ -31,6 +31,8 @@ pub(super) fn changes(desired: &Desired, observed: &BTreeMap<String, Observed>) 
             words.all(differences(desired, run, host));
         }
         words.all(unhealthy(host, run));
+        let reached = observed.get(*host).and_then(Observed::reached);
+        words.all(reached.map(secrets).unwrap_or_default());
         words.all(absent(desired, host, run));
     }
     if ids.len() > 1 {
@@ -109,6 +111,16 @@ fn facet(key: &str, new: &BTreeMap<String, String>, old: &BTreeMap<String, Strin
         (Some("rti"), ..) => "the RTI moved to another host".to_owned(),
         _ => format!("{key} changed"),
     }
+}
+
+/// Secrets that a host has not as they are now.
+fn secrets(reached: &Reached) -> Vec<String> {
+    let changed = reached.secrets_changed.iter();
+    let words = changed.flat_map(|(federate, names)| {
+        let word = move |name| format!("secret {name} changed: federate `{federate}`");
+        names.iter().map(word)
+    });
+    words.collect()
 }
 
 /// Why a part is not healthy.

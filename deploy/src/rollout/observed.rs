@@ -4,6 +4,8 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use serde::{Deserialize, Serialize};
 
+use crate::gives::Gives;
+
 /// A host that was asked.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
@@ -26,8 +28,10 @@ pub struct Reached {
     pub arch: String,
     /// Whether Docker can be used, or why not, with the fix.
     pub docker: Result<(), String>,
-    /// Whether its user may ask for realtime scheduling.
-    pub realtime: bool,
+    /// What federates may need and it gives.
+    pub gives: Gives,
+    /// Secrets whose value there is another one than asked for, or none, by federate.
+    pub secrets_changed: BTreeMap<String, BTreeSet<String>>,
     /// Free bytes where blobs are kept.
     pub disk_free: u64,
     /// Digests of the blobs that are there; those that nobody asked for may be missing.

@@ -386,12 +386,14 @@ fn unsuited(host: &str, wanted: &DesiredHost, reached: &Reached) -> Vec<Reason> 
         }),
         (Engine::Process | Engine::Docker, _) => {}
     }
-    // A container asks the engine, not the daemon's user.
-    if wanted.engine == Engine::Process && !reached.realtime && !wanted.realtime.is_empty() {
-        reasons.push(Reason::Realtime {
+    for (federate, needs) in &wanted.needs {
+        let lacks = reached.gives.lacks(wanted.engine, needs);
+        reasons.extend(lacks.into_iter().map(|lack| Reason::Lacks {
             host: host.to_owned(),
-            federates: wanted.realtime.clone(),
-        });
+            federate: federate.clone(),
+            what: lack.what,
+            fix: lack.fix,
+        }));
     }
     let missing = wanted.blobs.iter();
     let missing = missing.filter(|blob| !reached.blobs.contains(&blob.digest));

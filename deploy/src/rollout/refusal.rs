@@ -96,16 +96,17 @@ pub enum Reason {
         /// Milliseconds until it is free.
         left_ms: u64,
     },
-    /// It gives no realtime scheduling.
-    #[error(
-        "host `{host}` gives no realtime scheduling, which {federates} needs",
-        federates = listed("federate", federates)
-    )]
-    Realtime {
+    /// It does not give a federate what it needs.
+    #[error("host `{host}` cannot give federate `{federate}` {what}")]
+    Lacks {
         /// The host.
         host: String,
         /// Who needs it.
-        federates: Vec<String>,
+        federate: String,
+        /// What, and why not.
+        what: String,
+        /// What to do about it.
+        fix: String,
     },
     /// What is sent does not fit.
     #[error("host `{host}` has {free} bytes free, but {needed} bytes are to be sent")]
@@ -132,7 +133,7 @@ impl Reason {
             | Self::DaemonNewer { host, .. }
             | Self::RecordNewer { host, .. }
             | Self::Held { host, .. }
-            | Self::Realtime { host, .. }
+            | Self::Lacks { host, .. }
             | Self::Disk { host, .. } => host,
         }
     }
@@ -160,10 +161,7 @@ impl Reason {
             Self::Held { .. } => {
                 "wait for it; if whoever held it is gone, `ictus lock break` frees it".to_owned()
             }
-            Self::Realtime { .. } => {
-                "raise the limit `rtprio` of the daemon's user there, or leave `realtime` out"
-                    .to_owned()
-            }
+            Self::Lacks { fix, .. } => fix.clone(),
             Self::Disk { host, .. } => format!("free space on `{host}`"),
         }
     }

@@ -2,11 +2,13 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use ictus_deploy::Engine;
+use ictus_deploy::gives::{Denied, Gives};
+use ictus_deploy::placement::{Realtime, RealtimePolicy};
 use ictus_deploy::rollout::{
     Blob, Desired, DesiredHost, Held, MemberState, NewerRecord, Observed, Operation, Plan, Reached,
     Run, RunState, Stale, plan, plan_down,
 };
+use ictus_deploy::{Engine, Needs};
 
 fn names(names: &[&str]) -> Vec<String> {
     names.iter().map(|&name| name.to_owned()).collect()
@@ -17,7 +19,7 @@ fn host(engine: Engine, rti: bool, federates: &[&str], blob: (&str, u64)) -> Des
         engine,
         rti,
         federates: names(federates),
-        realtime: Vec::new(),
+        needs: BTreeMap::new(),
         blobs: vec![Blob {
             digest: blob.0.repeat(16),
             bytes: blob.1,
@@ -66,7 +68,8 @@ fn reached() -> Reached {
         version: "0.1.0".to_owned(),
         arch: "x86_64".to_owned(),
         docker: Ok(()),
-        realtime: true,
+        gives: Gives::default(),
+        secrets_changed: BTreeMap::new(),
         disk_free: 1 << 40,
         blobs: BTreeSet::new(),
         run: Ok(None),
@@ -423,17 +426,48 @@ fn every_refusal_names_host_cause_and_fix() {
         "the version before is understood"
     );
     let mut realtime = demo();
-    realtime.hosts.get_mut("bench").unwrap().realtime = names(&["planner"]);
+    let needs = Needs {
+        realtime: Some(Realtime {
+            policy: RealtimePolicy::Fifo,
+            priority: 60,
+            lock_memory: false,
+        }),
+        ..Needs::default()
+    };
+    let bench = realtime.hosts.get_mut("bench").unwrap();
+    bench.needs.insert("planner".to_owned(), needs);
     let mut there = observed(reached());
+    let denied = Denied {
+        why: "the limit `rtprio` is 0".to_owned(),
+        fix: "raise it".to_owned(),
+    };
     let none = Reached {
-        realtime: false,
+        gives: Gives {
+            realtime: Err(denied),
+            ..Gives::default()
+        },
         ..reached()
     };
     there.insert("bench".to_owned(), Observed::Reached(Box::new(none)));
     let refused = plan(&realtime, &there).unwrap_err().to_string();
-    assert!(refused.starts_with(
-        "host `bench` gives no realtime scheduling, which federate `planner` needs; "
-    ));
+    assert_eq!(
+        refused,
+        "host `bench` cannot give federate `planner` realtime priority 60: the limit `rtprio` is 0; raise it"
+    );
+}
+
+#[test]
+fn a_changed_secret_restarts_and_is_named() {
+    let mut there = running(&demo(), "r1");
+    assert!(plan(&demo(), &there).unwrap().is_empty());
+    let Some(Observed::Reached(nuc)) = there.get_mut("nuc") else {
+        panic!("it is there")
+    };
+    let token = BTreeSet::from(["TOKEN".to_owned()]);
+    nuc.secrets_changed.insert("radar".to_owned(), token);
+    let plan = plan(&demo(), &there).unwrap();
+    assert_eq!(plan.causes, ["secret TOKEN changed: federate `radar`"]);
+    assert!(!plan.is_empty());
 }
 
 #[test]

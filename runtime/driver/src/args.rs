@@ -33,6 +33,8 @@ pub(crate) struct RunArgs {
     pub(crate) data_address: Option<Ipv4Addr>,
     /// From where other federates connect; empty: from everywhere.
     pub(crate) allow: Vec<Ipv4Addr>,
+    /// Whether memory is locked before anything runs.
+    pub(crate) lock_memory: bool,
 }
 
 /// Why a command line is refused.
@@ -55,6 +57,7 @@ pub(crate) enum ArgsError {
 pub(crate) const USAGE: &str = "\
 usage: PROGRAM --plan PLAN.json [--federate NAME]... [--rti HOST:PORT] [-i ID]
                [--data-address IPv4] [--allow IPv4[,IPv4]...] [--trace DIR] [--timing DIR] [--status-fd N]
+               [--lock-memory]
        PROGRAM --plan-env VARIABLE [--status-socket PATH] [...]
        PROGRAM --describe [INSTANCES.json]
 
@@ -92,6 +95,7 @@ pub(crate) fn parse(args: impl IntoIterator<Item = String>) -> Result<Command, A
                 let text = value()?;
                 run.status_fd = Some(text.parse().map_err(|_| ArgsError::BadDescriptor(text))?);
             }
+            "--lock-memory" => run.lock_memory = true,
             "--data-address" => {
                 let text = value()?;
                 let address = text.parse().map_err(|_| ArgsError::BadAddress(text))?;
@@ -141,10 +145,10 @@ mod tests {
             rti: Some("127.0.0.1:15045".into()),
             federation_id: Some("x".into()),
             status_fd: Some(3),
+            lock_memory: true,
             ..RunArgs::default()
         };
-        let line =
-            "--plan p.json --federate a --federate b --rti 127.0.0.1:15045 -i x --status-fd 3";
+        let line = "--plan p.json --federate a --federate b --rti 127.0.0.1:15045 -i x --status-fd 3 --lock-memory";
         assert_eq!(words(line), Ok(Command::Run(Box::new(run))));
         let run = RunArgs {
             plan_env: Some("ICTUS_PLAN".into()),

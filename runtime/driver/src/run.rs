@@ -23,6 +23,7 @@ use ictus_coord::measure::LagNews;
 use ictus_coord::plan::Plan;
 use ictus_coord::report::{FederateStatus, exit};
 use ictus_core::{Duration, PhysicalTime, Tag};
+use nix::libc;
 use std::io::{self, Write};
 use std::net::{IpAddr, Ipv4Addr, SocketAddr, ToSocketAddrs};
 use std::process::ExitCode;
@@ -99,6 +100,9 @@ fn complain(message: &str, code: u8) -> ExitCode {
 }
 
 fn run_plan(args: &RunArgs, classes: &[Class]) -> Result<u8, RunError> {
+    if args.lock_memory {
+        lock_memory().map_err(RunError::LockMemory)?;
+    }
     let plan = read_plan(args)?;
     let ids = named_federates(&plan, &args.federates)?;
     match &args.rti {
@@ -138,6 +142,20 @@ fn read_plan(args: &RunArgs) -> Result<Plan, RunError> {
         path: path(),
         source,
     })
+}
+
+/// No page of this process, now or later, is written to swap or waited for. Executing a program undoes it, so nobody else
+/// can do it for us.
+#[expect(
+    unsafe_code,
+    reason = "mlockall stands behind features of nix and rustix that nothing else needs"
+)]
+fn lock_memory() -> io::Result<()> {
+    // SAFETY: it takes flags only, and changes nothing that a program could observe in its memory.
+    match unsafe { libc::mlockall(libc::MCL_CURRENT | libc::MCL_FUTURE) } {
+        0 => Ok(()),
+        _ => Err(io::Error::last_os_error()),
+    }
 }
 
 /// Every named federate on a thread of its own; the worst exit code wins.

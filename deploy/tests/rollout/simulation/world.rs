@@ -3,6 +3,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use ictus_deploy::Engine;
+use ictus_deploy::gives::Gives;
 use ictus_deploy::rollout::{
     Blob, Desired, DesiredHost, Held, MemberState, Observed, Operation, Outcome, Reached, Run,
     RunState, Step,
@@ -52,7 +53,7 @@ pub(crate) fn desired(hosts: &BTreeSet<String>, program: u32, parameter: u32) ->
             engine: Engine::Process,
             rti: index == 0,
             federates: vec![federate.clone()],
-            realtime: Vec::new(),
+            needs: BTreeMap::new(),
             blobs: vec![Blob {
                 digest: format!("program{program}"),
                 bytes: 1 << 20,
@@ -322,7 +323,8 @@ impl World {
             version: env!("CARGO_PKG_VERSION").to_owned(),
             arch: "x86_64".to_owned(),
             docker: Err("none".to_owned()),
-            realtime: false,
+            gives: Gives::default(),
+            secrets_changed: BTreeMap::new(),
             disk_free: 1 << 30,
             blobs: host.blobs.clone(),
             run: Ok(host.run.as_ref().map(|run| told(name, run))),

@@ -70,6 +70,9 @@ pub enum RunError {
     /// The descriptor of `--status-fd` cannot be written.
     #[error("cannot write status lines: {0}")]
     Status(io::Error),
+    /// The system does not let the memory be locked (`realtime: { lock_memory: true }`). Raise the limit `memlock`.
+    #[error("cannot lock memory: {0}; raise the limit `memlock`")]
+    LockMemory(io::Error),
     /// The system refused to wait or to make a descriptor.
     #[error("system error: {0}")]
     Io(io::Error),
@@ -95,6 +98,7 @@ impl RunError {
             | Self::Assembly(_)
             | Self::Observe(_)
             | Self::Status(_)
+            | Self::LockMemory(_)
             | Self::Io(_)
             | Self::Interrupted => exit::FAILED,
         }
