@@ -7,6 +7,7 @@ mod deployments;
 mod hosts;
 mod network;
 mod operator;
+mod secrets;
 
 use ictus_tests::rig::{self, Rig, Snapshot};
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -20,7 +21,12 @@ const HOSTS: u8 = 3;
 type Scenario = (&'static str, fn(&Rig));
 
 /// Every scenario of these modules, in order.
-const SCENARIOS: &[&[Scenario]] = &[hosts::SCENARIOS, deployments::SCENARIOS, network::SCENARIOS];
+const SCENARIOS: &[&[Scenario]] = &[
+    hosts::SCENARIOS,
+    deployments::SCENARIOS,
+    network::SCENARIOS,
+    secrets::SCENARIOS,
+];
 
 #[expect(clippy::print_stdout, reason = "a test's report")]
 fn main() -> ExitCode {

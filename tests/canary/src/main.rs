@@ -1,8 +1,10 @@
 //! A federation with a race on purpose, and one that breaks: `ictus verify` and `ictus up` must say so.
 
 use ictus::prelude::*;
+use secret::Keeper;
 use time::{Beat, Ear, Guard, Stamped};
 
+mod secret;
 mod time;
 
 /// Sends what no reaction should: a value that depends on physical time.
@@ -76,4 +78,6 @@ impl Counter {
     }
 }
 
-ictus::program![Racer, Faulty, Watcher, Counter, Beat, Ear, Guard, Stamped];
+ictus::program![
+    Racer, Faulty, Watcher, Counter, Beat, Ear, Guard, Stamped, Keeper
+];
