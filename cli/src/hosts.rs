@@ -78,6 +78,22 @@ pub(crate) async fn left(clients: &[Client], name: &str) -> BTreeMap<String, Way
     BTreeMap::new()
 }
 
+/// What says on any of these hosts that it is of the federation, and is not: a line each.
+pub(crate) async fn foreign(clients: &Clients, federation: &str) -> Vec<String> {
+    let mut lines = Vec::new();
+    for (host, client) in clients {
+        // An older daemon does not tell.
+        for found in client.foreign(federation).await.unwrap_or_default() {
+            let (container, federation) = (&found.container, &found.federation);
+            lines.push(format!(
+                "{host}: container `{container}` is foreign: it says that it is of federation `{federation}`, but no \
+                 record there has it; it is left alone (`docker rm -f {container}` there removes it)"
+            ));
+        }
+    }
+    lines
+}
+
 /// The other hosts of a run, as the record on one of them tells.
 pub(crate) fn others(views: &[FederationView], name: &str) -> BTreeMap<String, Way> {
     let parts = views.iter().filter(|view| view.name == name);

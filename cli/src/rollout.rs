@@ -22,11 +22,15 @@ use crate::session::{Session, request};
 
 mod again;
 mod execute;
+mod images;
 mod observe;
+pub(crate) mod patience;
 mod saved;
 
 pub(crate) use again::Again;
 pub(crate) use execute::{Executor, size, who};
+use images::Images;
+use observe::Wanted;
 pub(crate) use saved::SavedPlan;
 
 /// How long an ordered stop of a federation may take of which no manifest says more, in milliseconds.
@@ -41,6 +45,7 @@ pub(crate) struct Rollout<'a> {
     desired: Desired,
     /// Program files by digest.
     files: BTreeMap<String, PathBuf>,
+    images: Images,
     pub(crate) clients: Clients,
     pub(crate) plan: Plan,
     observed: ObservedHosts,
@@ -64,7 +69,9 @@ impl<'a> Rollout<'a> {
             files.insert(file.digest.clone(), path.to_path_buf());
             Ok(file)
         });
+        let images = Images::find(checked).await?;
         let desired = desired.map_err(CliError::failed)?;
+        let desired = desired.with_images(&images.files);
         let connected = connect_all(session, &ways(placement)).await;
         let blobs = |host: &str| -> Vec<String> {
             let host = desired.hosts.get(host);
@@ -72,7 +79,13 @@ impl<'a> Rollout<'a> {
             blobs.into_iter().flatten().collect()
         };
         let secrets = Secrets::read(&checked.federates);
-        let (clients, mut observed) = observe::all(connected, &desired.federation, &blobs).await;
+        let images_of = |host: &str| -> Vec<String> {
+            let host = desired.hosts.get(host);
+            let images = host.map(|host| host.images.iter().map(|it| it.asked_for().to_owned()));
+            images.into_iter().flatten().collect()
+        };
+        let asked = |host: &str| (blobs(host), images_of(host));
+        let (clients, mut observed) = observe::all(connected, &desired.federation, &asked).await;
         let wanted = (&desired, &secrets.values);
         observe::compare_secrets(&clients, &mut observed, wanted).await;
         let plan = plan(&desired, &observed).map_err(refused)?;
@@ -83,6 +96,7 @@ impl<'a> Rollout<'a> {
             trace,
             desired,
             files,
+            images,
             clients,
             plan,
             observed,
@@ -146,9 +160,15 @@ impl<'a> Rollout<'a> {
             ports: spec.ports,
             programs: here.iter().filter_map(program).collect(),
         };
+        let mut request = request(self.checked, self.trace);
+        for run in &mut request.federates {
+            // What is built here is an image there.
+            run.needs.build = None;
+            run.needs.image = self.images.of(&run.name);
+        }
         Some(StartRequest {
             part: Some(part),
-            ..request(self.checked, self.trace)
+            ..request
         })
     }
 
@@ -194,7 +214,7 @@ pub(crate) async fn stop(
     ways: &BTreeMap<String, Way>,
 ) -> Result<(Clients, Plan), CliError> {
     let connected = connect_all(session, ways).await;
-    let (clients, observed) = observe::all(connected, name, &|_| Vec::new()).await;
+    let (clients, observed) = observe::all(connected, name, &|_| Wanted::default()).await;
     let plan = plan_stop(name, &observed, STOP_LIMIT_MS).map_err(refused)?;
     Ok((clients, plan))
 }
@@ -207,7 +227,7 @@ pub(crate) async fn down(
     purge: bool,
 ) -> Result<(Clients, Plan), CliError> {
     let connected = connect_all(session, ways).await;
-    let (clients, observed) = observe::all(connected, name, &|_| Vec::new()).await;
+    let (clients, observed) = observe::all(connected, name, &|_| Wanted::default()).await;
     let plan = plan_down(name, &observed, purge, STOP_LIMIT_MS).map_err(refused)?;
     Ok((clients, plan))
 }

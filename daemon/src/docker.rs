@@ -27,12 +27,14 @@ use tokio::time::timeout;
 use crate::api::part::DockerFacts;
 
 mod error;
+mod images;
 mod spec;
 #[cfg(test)]
 mod tests;
 
 pub(crate) use error::EngineError;
 use error::{is_conflict, is_not_found};
+pub(crate) use images::{archive_of, sent_name};
 pub(crate) use spec::{Binding, ContainerSpec, label};
 
 /// Where engines listen unless `DOCKER_HOST` says otherwise.
@@ -97,6 +99,12 @@ pub(crate) struct Image {
     pub(crate) user: String,
     /// Its working directory; empty: `/`.
     pub(crate) workdir: String,
+    /// The ids of its layers, the lowest first.
+    pub(crate) layers: Vec<String>,
+    /// Its names.
+    pub(crate) tags: Vec<String>,
+    /// Its size.
+    pub(crate) bytes: u64,
 }
 
 impl Engine {
@@ -169,6 +177,9 @@ impl Engine {
                 env: config.env.unwrap_or_default(),
                 user: config.user.unwrap_or_default(),
                 workdir: config.working_dir.unwrap_or_default(),
+                layers: found.root_fs.and_then(|it| it.layers).unwrap_or_default(),
+                tags: found.repo_tags.unwrap_or_default(),
+                bytes: found.size.and_then(|it| it.try_into().ok()).unwrap_or(0),
             }
         }))
     }

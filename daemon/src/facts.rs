@@ -24,6 +24,7 @@ pub(crate) fn of_this_host(paths: &Paths, docker: Result<DockerFacts, String>) -
         user: user(),
         cpus: u32::try_from(cpus).unwrap_or(u32::MAX),
         disk_free: disk.map_or(0, |disk| disk.f_bavail.saturating_mul(disk.f_frsize)),
+        state: paths.state.clone(),
         gives: gives(paths),
         docker,
         starts_at_boot: false,

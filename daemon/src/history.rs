@@ -88,6 +88,14 @@ impl History {
             .collect()
     }
 
+    /// Names and ids of the images that generations need.
+    pub(crate) fn images(&self) -> BTreeSet<String> {
+        let all = self.all().into_iter().filter_map(|it| it.request);
+        all.flat_map(|request| request.federates)
+            .filter_map(|run| run.needs.image)
+            .collect()
+    }
+
     /// The newest first; files that are none, or of a newer version, are passed over.
     fn all(&self) -> Vec<Generation> {
         let files = fs::read_dir(&self.0).into_iter().flatten().flatten();

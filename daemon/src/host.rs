@@ -23,6 +23,8 @@ use crate::scrape::Listeners;
 use crate::store::{self, Directory, Leave, Record, StoreError};
 use crate::{rescue, secrets, stamp};
 
+mod foreign;
+mod images;
 mod needs;
 mod parts;
 mod recorded;
@@ -565,6 +567,9 @@ pub(crate) fn with_sources(error: &dyn std::error::Error) -> String {
     let mut source = error.source();
     while let Some(error) = source {
         text.push_str(&format!(": {error}"));
+        if is_full(error) {
+            text.push_str("; free space there (`df` says where it went)");
+        }
         source = error.source();
     }
     text
@@ -580,4 +585,14 @@ fn error(code: ErrorCode, message: String) -> ApiError {
         message,
         known: Vec::new(),
     }
+}
+
+/// Whether a disk did not take what was written.
+fn is_full(error: &(dyn std::error::Error + 'static)) -> bool {
+    let io = error.downcast_ref::<std::io::Error>();
+    let full = [
+        std::io::ErrorKind::StorageFull,
+        std::io::ErrorKind::QuotaExceeded,
+    ];
+    io.is_some_and(|error| full.contains(&error.kind()))
 }

@@ -18,6 +18,7 @@ mod files;
 mod history;
 mod host;
 pub mod identity;
+pub mod images;
 mod leases;
 pub mod logs;
 mod metrics;

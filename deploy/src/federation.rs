@@ -78,14 +78,13 @@ fn origin<'a>(
     let path = ["federates", name];
     let at = |key| ["federates", name, key];
     if let Some(kind) = foreign_key(federate) {
-        if federate.image.is_some() && kind != "image" {
-            let message = format!("`{name}` has both `binary` and `image`");
-            report.add(
-                "F025",
-                Place::key(&at("image")),
-                message,
-                "keep one of them",
-            );
+        let others = [
+            ("image", federate.image.is_some()),
+            ("build", federate.build.is_some()),
+        ];
+        for (key, _) in others.iter().filter(|(key, given)| *given && *key != kind) {
+            let message = format!("`{name}` has both `{kind}` and `{key}`");
+            report.add("F025", Place::key(&at(key)), message, "keep one of them");
         }
         let ours = [
             ("program", federate.program.is_some()),
@@ -144,11 +143,14 @@ fn origin<'a>(
 
 /// The key that makes a federate foreign.
 fn foreign_key(federate: &Federate) -> Option<&'static str> {
-    match (&federate.binary, &federate.image) {
-        (Some(_), _) => Some("binary"),
-        (None, Some(_)) => Some("image"),
-        (None, None) => None,
-    }
+    let keys = [
+        ("binary", federate.binary.is_some()),
+        ("image", federate.image.is_some()),
+        ("build", federate.build.is_some()),
+    ];
+    keys.into_iter()
+        .find(|(_, given)| *given)
+        .map(|(key, _)| key)
 }
 
 /// The program that a federate names, or the only one there is.

@@ -184,7 +184,7 @@ pub(crate) struct Program {
     pub(crate) binary: Option<String>,
 }
 
-/// One federate: a class of a program, or a prebuilt Lingua Franca federate (`binary` or `image`).
+/// One federate: a class of a program, or a prebuilt Lingua Franca federate (`binary`, `image` or `build`).
 #[derive(Clone, Debug, Default, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct Federate {
@@ -199,6 +199,8 @@ pub(crate) struct Federate {
     pub(crate) binary: Option<String>,
     /// Foreign: in place of `binary`, an image with the executable (engine docker).
     pub(crate) image: Option<String>,
+    /// Foreign: in place of `image`, a folder with a Dockerfile, of which it is built (engine docker).
+    pub(crate) build: Option<ImageBuild>,
     /// Foreign: arguments after those that every LF federate gets.
     #[serde(default)]
     pub(crate) args: Vec<String>,
@@ -249,6 +251,17 @@ pub(crate) struct Federate {
     /// Tests only: a clock that is wrong on purpose.
     #[serde(default)]
     pub(crate) clock: TestClock,
+}
+
+/// A folder of which an image is built, by the Docker engine of whoever deploys.
+#[derive(Clone, Debug, Default, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub(crate) struct ImageBuild {
+    /// The folder that the build sees, relative to the manifest.
+    #[schemars(required)]
+    pub(crate) context: Option<String>,
+    /// The Dockerfile in it; left out, `Dockerfile`.
+    pub(crate) dockerfile: Option<String>,
 }
 
 /// What messages that come too late do besides being counted.

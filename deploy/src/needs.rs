@@ -1,13 +1,13 @@
 //! What each federate needs from its host, and whether the host's engine can give it.
 
 use std::collections::BTreeMap;
-use std::path::PathBuf;
+use std::path::{Component, Path, PathBuf};
 
 use crate::env_file::{self, is_variable};
 use crate::federation::{Member, Origin};
 use crate::hosts::{Outside, Seating};
 use crate::manifest::{Secret, VolumeText};
-use crate::placement::{Engine, Needs, Realtime, SecretSource, Volume};
+use crate::placement::{Engine, ImageBuild, Needs, Realtime, SecretSource, Volume};
 use crate::problem::{Place, Report};
 
 /// The least memory that the docker engine accepts, in bytes.
@@ -86,8 +86,31 @@ fn outfit(member: &Member<'_>, outside: &Outside<'_>, report: &mut Report) -> Ou
         realtime,
         secrets,
         image: federate.image.clone(),
+        build: build(member, outside, report),
     };
     Outfit { needs, env }
+}
+
+/// The folder of which its image is built; one without a Dockerfile is reported.
+fn build(member: &Member<'_>, outside: &Outside<'_>, report: &mut Report) -> Option<ImageBuild> {
+    let build = member.federate.build.as_ref()?;
+    let context = outside.dir.join(build.context.as_ref()?);
+    let dockerfile = build.dockerfile.clone();
+    let dockerfile = dockerfile.unwrap_or_else(|| "Dockerfile".to_owned());
+    let inside = Path::new(&dockerfile)
+        .components()
+        .all(|part| matches!(part, Component::Normal(_)));
+    if !inside || (outside.read)(&context.join(&dockerfile)).is_err() {
+        let path = ["federates", member.name, "build"];
+        let message = format!("there is no `{dockerfile}` in {}", context.display());
+        let fix = "write `build: { context: FOLDER, dockerfile: FILE-IN-IT }`";
+        report.add("F036", Place::key(&path), message, fix);
+        return None;
+    }
+    Some(ImageBuild {
+        context,
+        dockerfile,
+    })
 }
 
 /// Reports what only another engine gives.
@@ -104,6 +127,7 @@ fn engine(member: &Member<'_>, (index, seating): (usize, &Seating<'_>), report: 
         ("devices", !federate.devices.is_empty()),
         ("volumes", !federate.volumes.is_empty()),
         ("image", federate.image.is_some()),
+        ("build", federate.build.is_some()),
     ];
     for (key, _) in contained.iter().filter(|(_, given)| *given) {
         let (message, fix) = match host {

@@ -149,6 +149,27 @@ pub struct Needs {
     pub realtime: Option<Realtime>,
     /// Secrets by name; a federate finds the file of each in `NAME_FILE`.
     pub secrets: BTreeMap<String, SecretSource>,
-    /// An image of its own in place of a program (engine docker).
+    /// An image of its own in place of a program (engine docker): its name, or the id of one that was sent.
     pub image: Option<String>,
+    /// A folder of which such an image is built first.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub build: Option<ImageBuild>,
+}
+
+/// A folder of which an image is built.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ImageBuild {
+    /// What the build sees; absolute.
+    pub context: PathBuf,
+    /// The Dockerfile in it.
+    pub dockerfile: String,
+}
+
+impl Needs {
+    /// Whether it runs in an image of its own.
+    #[must_use]
+    pub const fn has_image(&self) -> bool {
+        self.image.is_some() || self.build.is_some()
+    }
 }

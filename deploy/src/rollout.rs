@@ -23,7 +23,7 @@ mod show;
 mod step;
 
 pub use apply::{Apply, Moment, Outcome, Phase};
-pub use desired::{Blob, Desired, DesiredError, DesiredHost, ProgramFile};
+pub use desired::{Blob, Desired, DesiredError, DesiredHost, Image, ImageFile, ProgramFile};
 pub use observed::{Held, MemberState, NewerRecord, Observed, Reached, Run, RunState};
 pub use outcome::{Cause, Ended, Merged, PartOutcome, merge_outcomes};
 pub use plan::{Part, Plan, Stale, plan, plan_down, plan_stop};

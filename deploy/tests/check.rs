@@ -43,6 +43,8 @@ impl Bench {
             "A=1\nexport B=hunter2\nC\nA=hunter2\n",
         )
         .unwrap();
+        fs::create_dir(dir.path().join("chart")).unwrap();
+        fs::write(dir.path().join("chart/Dockerfile"), "FROM scratch\n").unwrap();
         fs::create_dir(dir.path().join("bin")).unwrap();
         let names = [
             "fake", "tools", "camera", "hang", "crash", "garbage", "flood", "old", "short",
@@ -113,7 +115,7 @@ fn the_example_is_a_federation() {
         .unwrap_or_else(|p| panic!("{p}"));
     let plan = &checked.plan;
     let names = plan.federates.iter().map(|one| one.name.as_str());
-    assert!(names.eq(["radar", "planner", "logger", "camera", "viewer"]));
+    assert!(names.eq(["radar", "planner", "logger", "camera", "viewer", "chart"]));
     assert_eq!(plan.timeout_ns, Some(10_000_000_000));
     assert!(plan.extensions);
     let wires: Vec<String> = plan
@@ -194,7 +196,7 @@ fn the_example_is_decentralized() {
     assert_eq!(plan.clock, clock);
     let listen = checked.settings.metrics_listen;
     assert_eq!(listen, Some("127.0.0.1:9464".parse().unwrap()));
-    let [radar, planner, logger, camera, _viewer] = plan.federates.as_slice() else {
+    let [radar, planner, logger, camera, _viewer, _chart] = plan.federates.as_slice() else {
         panic!("{plan:?}")
     };
     assert_eq!(radar.test_clock_offset_ns, -50_000_000);
@@ -232,7 +234,8 @@ planner 0.5 ms = radar offset 0 + radar launch lag 1.0 + network 4.0 + clock 0.5
 logger 7.5 ms = planner offset 0.5 + planner launch lag 2.0 + network 4.0 + clock 1.0 - after 0
 camera 6.0 ms as declared; required 6.0 ms = planner offset 0.5 + planner launch lag 2.0 + network 3.0 + clock 0.5 \
          - after 0\n\
-viewer 0 ms: no input to wait for"
+viewer 0 ms: no input to wait for
+chart 0 ms: no input to wait for"
     );
     let warnings: Vec<&str> = checked.warnings.iter().map(|one| one.code).collect();
     assert_eq!(warnings, ["W003"], "only `max_lead` has no effect");
@@ -325,6 +328,7 @@ fn the_example_is_placed() {
         }),
         secrets: secrets.into(),
         image: None,
+        build: None,
     };
     assert_eq!(radar.needs, needs);
     assert_eq!(radar.env["GAIN"], "3");
@@ -335,10 +339,13 @@ fn the_example_is_placed() {
         Some("registry.lan/viewer:1.2")
     );
     assert_eq!(viewer.executable, PathBuf::new());
+    let chart = checked.federates[5].needs.build.as_ref().unwrap();
+    assert!(chart.context.is_absolute() && chart.context.ends_with("chart"));
+    assert_eq!(chart.dockerfile, "Dockerfile");
     let portable: Vec<bool> = checked.federates.iter().map(|run| run.portable).collect();
     assert_eq!(
         portable,
-        [true, true, false, false, false],
+        [true, true, false, false, false, false],
         "radar's program is the planner's too"
     );
 }

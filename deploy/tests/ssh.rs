@@ -622,6 +622,22 @@ async fn twelve_channels_at_once_all_work() {
 }
 
 #[tokio::test]
+async fn a_host_that_drops_silent_clients_keeps_an_idle_session() {
+    if !available() {
+        return;
+    }
+    let sshd = Sshd::with(
+        &["ed25519"],
+        "ClientAliveInterval 3\nClientAliveCountMax 1\n",
+    );
+    let connection = open(&sshd, &sshd.options(Method::Ssh2)).await;
+    echo(&connection, noise(10)).await;
+    // Longer than the host waits for a sign of life: twice its interval.
+    tokio::time::sleep(Duration::from_secs(9)).await;
+    echo(&connection, noise(10)).await;
+}
+
+#[tokio::test]
 async fn a_lost_connection_ends_every_channel_with_its_reason() {
     if !available() {
         return;

@@ -5,8 +5,12 @@
 
 mod deployments;
 mod hosts;
+mod images;
+mod killed;
+mod losses;
 mod network;
 mod operator;
+mod rows;
 mod secrets;
 
 use ictus_tests::rig::{self, Rig, Snapshot};
@@ -26,6 +30,10 @@ const SCENARIOS: &[&[Scenario]] = &[
     deployments::SCENARIOS,
     network::SCENARIOS,
     secrets::SCENARIOS,
+    killed::SCENARIOS,
+    rows::SCENARIOS,
+    images::SCENARIOS,
+    losses::SCENARIOS,
 ];
 
 #[expect(clippy::print_stdout, reason = "a test's report")]

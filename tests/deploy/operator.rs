@@ -43,15 +43,22 @@ impl<'r> Operator<'r> {
     /// One whose hosts are ready.
     pub(crate) fn with_hosts(rig: &'r Rig) -> Self {
         let operator = Self::new(rig);
-        for host in rig.hosts() {
-            let said = operator.ok(&["host", "add", &target(host), "--accept-new"]);
-            assert!(said.contains("ictusd"), "{said}");
-        }
+        operator.add(rig.hosts());
         operator
     }
 
-    pub(crate) fn run(&self, args: &[&str]) -> Output {
-        Command::new("timeout")
+    /// Gets these hosts ready.
+    pub(crate) fn add(&self, hosts: &[Host]) {
+        for host in hosts {
+            let said = self.ok(&["host", "add", &target(host), "--accept-new"]);
+            assert!(said.contains("ictusd"), "{said}");
+        }
+    }
+
+    /// `ictus ARGS`, bounded in time.
+    pub(crate) fn command(&self, args: &[&str]) -> Command {
+        let mut command = Command::new("timeout");
+        command
             .args(["--kill-after=5", BOUND_S])
             .arg(ictus())
             .args(args)
@@ -61,9 +68,12 @@ impl<'r> Operator<'r> {
             .env("ICTUS_DAEMON_IDLE_MS", "1000")
             .env_remove("XDG_RUNTIME_DIR")
             .env_remove("SSH_AUTH_SOCK")
-            .stdin(Stdio::null())
-            .output()
-            .unwrap()
+            .stdin(Stdio::null());
+        command
+    }
+
+    pub(crate) fn run(&self, args: &[&str]) -> Output {
+        self.command(args).output().unwrap()
     }
 
     /// Expects success; gives both streams.
@@ -95,7 +105,13 @@ impl<'r> Operator<'r> {
 
     /// Removes everything from every host, so that the leak checker finds nothing.
     pub(crate) fn leave(self) {
-        for host in self.rig.hosts() {
+        let rig = self.rig;
+        self.remove(rig.hosts());
+    }
+
+    /// The same for these hosts.
+    pub(crate) fn remove(self, hosts: &[Host]) {
+        for host in hosts {
             self.ok(&["host", "rm", &target(host)]);
         }
     }

@@ -8,9 +8,10 @@ use ictusd::api::recorded::Kept;
 
 use super::events::describe_outcome;
 use crate::args::duration;
-use crate::error::CliError;
+use crate::error::{CliError, Kind};
+use crate::hosts::foreign;
 use crate::interrupts::Interrupts;
-use crate::rollout::{self, Executor, size};
+use crate::rollout::{self, Executor, patience, size};
 use crate::session::{Abroad, Session, Whereabouts, within};
 use crate::ui::Ui;
 
@@ -67,8 +68,16 @@ impl Down {
         abroad: &Abroad,
     ) -> Result<(), CliError> {
         let mut interrupts = Interrupts::new()?;
-        let (clients, plan) =
-            rollout::down(session, &abroad.name, &abroad.ways, self.purge).await?;
+        let at = (abroad.name.as_str(), &abroad.ways);
+        let planned = match rollout::down(session, at.0, at.1, self.purge).await {
+            Err(refusal) if refusal.kind == Kind::Held => {
+                patience::outlive(ui, session, at, &mut interrupts, refusal).await?;
+                rollout::down(session, at.0, at.1, self.purge).await
+            }
+            planned => planned,
+        };
+        let (clients, plan) = planned?;
+        let asked = clients.clone();
         let local = abroad.ways.values().any(|way| *way == Way::Local);
         if plan.steps.is_empty() {
             ui.message(&plan.to_string());
@@ -83,6 +92,9 @@ impl Down {
             if !verdict.kept.is_empty() {
                 ui.message("the same with `--purge` removes them");
             }
+        }
+        for warning in foreign(&asked, &abroad.name).await {
+            ui.warning(&warning);
         }
         if local {
             session.daemon().await?.end().await?;

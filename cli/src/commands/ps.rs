@@ -10,7 +10,7 @@ use serde::Serialize;
 
 use crate::error::{CliError, Kind};
 use crate::hosts::outcome::headline;
-use crate::hosts::{Clients, connect_all};
+use crate::hosts::{Clients, connect_all, foreign};
 use crate::session::{Abroad, Session, Whereabouts, ago};
 use crate::ui::{Table, Ui, nanoseconds, one_line};
 
@@ -71,6 +71,9 @@ impl Ps {
                 ui.clear()?;
             }
             hosts.show(ui)?;
+            for warning in foreign(&hosts.clients, &abroad.name).await {
+                ui.warning(&warning);
+            }
             if !self.watch {
                 return hosts.result();
             }

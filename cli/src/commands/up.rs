@@ -14,8 +14,9 @@ use super::events::{describe, describe_outcome};
 use super::logs;
 use crate::args::{ManifestArgs, duration};
 use crate::error::{CliError, Kind};
+use crate::hosts::ways;
 use crate::interrupts::Interrupts;
-use crate::rollout::{Executor, Rollout, SavedPlan, size};
+use crate::rollout::{Executor, Rollout, SavedPlan, patience, size};
 use crate::secrets::Secrets;
 use crate::session::{Session, checked, count, request, succeed};
 use crate::ui::Ui;
@@ -161,11 +162,18 @@ impl Up {
         let since = Instant::now();
         let mut interrupts = Interrupts::new()?;
         let trace = saved.as_ref().map_or(self.trace, |saved| saved.trace);
-        let mut rollout = Rollout::new(session, checked, placement, trace).await?;
+        let name = &checked.plan.federation;
+        let mut rollout = match Rollout::new(session, checked, placement, trace).await {
+            Err(refusal) if refusal.kind == Kind::Held => {
+                let at = (name.as_str(), &ways(placement));
+                patience::outlive(ui, session, at, &mut interrupts, refusal).await?;
+                Rollout::new(session, checked, placement, trace).await?
+            }
+            rollout => rollout?,
+        };
         if let Some(saved) = saved {
             rollout.follow(saved)?;
         }
-        let name = &checked.plan.federation;
         if rollout.is_done() {
             ui.message(&format!("{name} is already running from the same manifest"));
         } else {

@@ -9,6 +9,7 @@ use ictus_deploy::{FederateRun, Needs};
 use ictusd::api::part::{Part, PrepareRequest};
 use ictusd::api::recorded::Generation;
 
+use super::observe::Wanted;
 use super::{ObservedHosts, next_generation, observe, refused};
 use crate::error::CliError;
 use crate::hosts::{Clients, connect_all};
@@ -66,7 +67,7 @@ impl Again {
             }
         }
         let connected = asked.into_iter().map(|(host, client)| (host, Ok(client)));
-        let found = observe::all(connected.collect(), federation, &|_| Vec::new()).await;
+        let found = observe::all(connected.collect(), federation, &|_| Wanted::default()).await;
         let (clients, observed): (Clients, ObservedHosts) = found;
         let plan = plan(&desired, &observed).map_err(refused)?;
         let number = next_generation(&clients, federation).await;
@@ -160,6 +161,7 @@ fn desired(
             federates: runs.iter().map(|run| run.name.clone()).collect(),
             // They are there: that was asked.
             blobs: Vec::new(),
+            images: Vec::new(),
         };
         hosts.insert(host.clone(), wanted);
     }

@@ -25,8 +25,10 @@ use crate::interrupts::Interrupts;
 use crate::ui::Ui;
 
 mod begin;
+mod resend;
 mod stages;
 
+use resend::{Stock, refused};
 use stages::Stages;
 
 /// How long a lease lasts without renewal: who is gone for so long has gone.
@@ -38,7 +40,7 @@ const RENEWAL: Duration = Duration::from_secs(8);
 #[derive(Debug, Default)]
 struct Work {
     requests: BTreeMap<String, PrepareRequest>,
-    files: BTreeMap<String, PathBuf>,
+    stock: Stock,
     rti: Option<(String, Ipv4Addr)>,
 }
 
@@ -96,6 +98,8 @@ enum Effect {
     Fence(u64),
     Sent(u64),
     Left(Vec<Kept>),
+    /// Bytes, and how many layers they were of how many.
+    SentLayers((u64, usize, usize)),
     Began(Box<Stream<Happening>>),
     Renewed,
 }
@@ -128,7 +132,10 @@ impl Executor {
             .zip(rollout.rti_address());
         let work = Work {
             requests,
-            files: rollout.files,
+            stock: Stock {
+                files: rollout.files,
+                images: rollout.images,
+            },
             rti,
         };
         let federates = rollout.checked.federates.len();
@@ -226,7 +233,7 @@ impl Executor {
                 self.committed.get_or_insert_with(Instant::now);
                 self.listening = Some((step.host.clone(), step.id));
             }
-            Operation::SendBlob { bytes, .. } => {
+            Operation::SendBlob { bytes, .. } | Operation::SendImage { bytes, .. } => {
                 ui.progress("sending", &format!("{}: {}", step.host, size(*bytes)));
             }
             Operation::Lease
@@ -248,6 +255,7 @@ impl Executor {
             request: self.request(&step),
             file: self.file(&step),
             kill: self.kill,
+            stock: self.stock(&step),
         };
         calls.spawn(call.make(step));
     }
@@ -263,11 +271,24 @@ impl Executor {
         })
     }
 
+    /// What this step may send.
+    fn stock(&self, step: &Step) -> Stock {
+        let sends = matches!(
+            step.operation,
+            Operation::SendImage { .. } | Operation::Prepare { .. }
+        );
+        if sends {
+            self.work.stock.clone()
+        } else {
+            Stock::default()
+        }
+    }
+
     fn file(&self, step: &Step) -> Option<PathBuf> {
         let Operation::SendBlob { digest, .. } = &step.operation else {
             return None;
         };
-        self.work.files.get(digest).cloned()
+        self.work.stock.files.get(digest).cloned()
     }
 
     fn take(&mut self, ui: &mut Ui, answer: Answer) {
@@ -280,6 +301,12 @@ impl Executor {
             Effect::Nothing => {}
             Effect::Fence(fence) => {
                 self.fences.insert(step.host.clone(), fence);
+                let steps = &self.apply.plan().steps;
+                let leases = steps.iter().filter(|it| it.operation == Operation::Lease);
+                if self.fences.len() == leases.count() {
+                    let hosts = self.fences.keys().cloned().collect();
+                    ui.stage("leased", &listed(&hosts));
+                }
             }
             Effect::Sent(bytes) => {
                 self.sent += bytes;
@@ -290,6 +317,15 @@ impl Executor {
                 let host = step.host.clone();
                 self.kept
                     .extend(kept.into_iter().map(|it| (host.clone(), it)));
+            }
+            Effect::SentLayers((bytes, layers, of)) => {
+                self.sent += bytes;
+                let size = size(bytes);
+                let detail = format!(
+                    "{}: {size} ({layers} of {of} layers) for {}",
+                    step.host, step.cause
+                );
+                ui.stage("sent", &detail);
             }
             Effect::Began(stream) => {
                 self.parts.add(step.host.clone(), *stream);
@@ -325,6 +361,7 @@ impl Executor {
             Operation::RemovePart { .. } | Operation::StopPart { .. } => "undone",
             Operation::Lease
             | Operation::SendBlob { .. }
+            | Operation::SendImage { .. }
             | Operation::CommitRti
             | Operation::Commit
             | Operation::AwaitHealthy
@@ -471,6 +508,7 @@ struct Call {
     request: Option<PrepareRequest>,
     file: Option<PathBuf>,
     kill: bool,
+    stock: Stock,
 }
 
 impl Call {
@@ -506,6 +544,12 @@ impl Call {
                 let sent = client.send_blob(key, digest, file, counter).await?;
                 Ok((Outcome::Done, Effect::Sent(sent)))
             }
+            Operation::SendImage { image, .. } => {
+                match self.stock.images.send(client, key, image).await {
+                    Ok(sent) => Ok((Outcome::Done, Effect::SentLayers(sent))),
+                    Err(error) => refused(error).map(|what| (failed(&what), Effect::Nothing)),
+                }
+            }
             Operation::StopOld { run } | Operation::StopPart { run } => {
                 if self.is_there(run).await? {
                     let mut stream = client.stop_part(key, self.kill).await?;
@@ -534,8 +578,19 @@ impl Call {
                 let Some(request) = &self.request else {
                     return Ok((failed("there is nothing to prepare"), Effect::Nothing));
                 };
+                let sent = match self.send_again(request).await {
+                    Ok(sent) => sent,
+                    Err(error) => {
+                        return refused(error).map(|what| (failed(&what), Effect::Nothing));
+                    }
+                };
                 client.prepare(key, request).await?;
-                done
+                let effect = if sent > 0 {
+                    Effect::Sent(sent)
+                } else {
+                    Effect::Nothing
+                };
+                Ok((Outcome::Done, effect))
             }
             Operation::CommitRti | Operation::Commit => {
                 let rti = self.rti.filter(|_| *operation == Operation::Commit);

@@ -14,11 +14,14 @@ use crate::commands::events::describe_outcome;
 use crate::error::CliError;
 use crate::hosts::Clients;
 
+/// Digests of blobs, and names or ids of images, that a host is asked for.
+pub(super) type Wanted = (Vec<String>, Vec<String>);
+
 /// Asks all; those that do not answer are told as such.
 pub(super) async fn all(
     connected: BTreeMap<String, Result<Client, CliError>>,
     federation: &str,
-    blobs: &dyn Fn(&str) -> Vec<String>,
+    wanted: &dyn Fn(&str) -> Wanted,
 ) -> (Clients, ObservedHosts) {
     let asked = connected.into_iter().map(|(host, client)| async move {
         let client = match client {
@@ -28,7 +31,7 @@ pub(super) async fn all(
                 return (host, None, Observed::Unreachable { why });
             }
         };
-        let observed = match one(&client, federation, blobs(&host)).await {
+        let observed = match one(&client, federation, wanted(&host)).await {
             Ok(reached) => Observed::Reached(Box::new(reached)),
             Err(error) => Observed::Unreachable {
                 why: CliError::from(error).to_string(),
@@ -74,12 +77,16 @@ pub(super) async fn compare_secrets(
 async fn one(
     client: &Client,
     federation: &str,
-    blobs: Vec<String>,
+    (blobs, images): Wanted,
 ) -> Result<Reached, ClientError> {
     let facts = client.host().await?;
     let leases = client.leases().await?;
     let lease = leases.into_iter().find(|it| it.federation == federation);
     let missing: BTreeSet<String> = client.missing_blobs(&blobs).await?.into_iter().collect();
+    let images = match images.as_slice() {
+        [] => BTreeMap::new(),
+        images => client.images(federation, images).await?,
+    };
     Ok(Reached {
         version: facts.version,
         arch: facts.arch,
@@ -87,6 +94,11 @@ async fn one(
         gives: facts.gives,
         secrets_changed: BTreeMap::new(),
         disk_free: facts.disk_free,
+        state: facts.state,
+        images: images
+            .into_iter()
+            .map(|(image, it)| (image, it.arch))
+            .collect(),
         blobs: blobs
             .into_iter()
             .filter(|it| !missing.contains(it))

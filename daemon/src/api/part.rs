@@ -3,17 +3,22 @@
 //! | call | answer |
 //! |---|---|
 //! | `GET /v1/host` | [`HostFacts`] |
+//! | `GET /v1/foreign?federation=NAME` | a list of [`Foreign`] |
 //! | `POST /v1/leases/NAME` with a [`LeaseRequest`] | [`Lease`]; held by somebody else: [`super::ErrorCode::Held`] |
 //! | `PUT /v1/leases/NAME?fence=F` | renews it: [`Lease`] |
 //! | `DELETE /v1/leases/NAME?fence=F`, or `?break=WHO` | releases it, or breaks it whoever holds it |
 //! | `GET /v1/leases` | a list of [`LeaseView`] |
 //! | `POST /v1/blobs` with a list of digests | those that are not there |
 //! | `PUT /v1/blobs/DIGEST?fence=F&federation=NAME` with the bytes | nothing; refused when they are others |
+//! | `POST /v1/images` with a list of names and ids | those that are there, each with an [`ImageFacts`] |
+//! | `POST /v1/images/layers` with the layers of an image, the lowest first | those that are not there |
+//! | `PUT /v1/images/ID?fence=F&federation=NAME` with a compressed archive | nothing; what it leaves out must be there |
 //! | `PUT /v1/federations/NAME?fence=F` with a [`PrepareRequest`] | [`Prepared`]; nothing runs yet |
 //! | `POST /v1/federations/NAME/commit` with a [`CommitRequest`] | a stream of [`super::Happening`] until the part ends; closing it before `healthy` undoes the part |
 
 use std::collections::BTreeMap;
 use std::net::{Ipv4Addr, SocketAddrV4};
+use std::path::PathBuf;
 
 use ictus_deploy::gives::Gives;
 use ictus_deploy::placement::{Engine, PortRange, Way};
@@ -148,6 +153,9 @@ pub struct HostFacts {
     pub cpus: u32,
     /// Free bytes where state is kept.
     pub disk_free: u64,
+    /// Where that is; empty when the daemon is an older one.
+    #[serde(default)]
+    pub state: PathBuf,
     /// What federates may need and it gives.
     #[serde(default)]
     pub gives: Gives,
@@ -168,4 +176,28 @@ pub struct DockerFacts {
     pub storage_driver: String,
     /// `1` or `2`.
     pub cgroup_version: String,
+}
+
+/// A container that says that it is of a federation, and is in no record of this host. It is never touched.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Foreign {
+    /// Its name.
+    pub container: String,
+    /// What it says.
+    pub federation: String,
+}
+
+/// An image of a host's engine.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct ImageFacts {
+    /// Its id there.
+    pub id: String,
+    /// What it is for, as Rust names it; Docker's name when Rust has none.
+    pub arch: String,
+}
+
+/// The name under which an image is sent for a federation; absent when `id` is no `sha256:...`.
+#[must_use]
+pub fn sent_name(federation: &str, id: &str) -> Option<String> {
+    crate::docker::sent_name(federation, id)
 }

@@ -1,8 +1,9 @@
 //! The client's calls for a host's part; see [`crate::api::part`].
 
+use std::collections::{BTreeMap, BTreeSet};
 use std::convert::Infallible;
 use std::fs::File;
-use std::io::{self, Read, Write};
+use std::io::{self, BufWriter, Write};
 use std::path::Path;
 use std::pin::Pin;
 use std::sync::Arc;
@@ -17,11 +18,14 @@ use hyper::body::{Body, Bytes, Frame};
 use tokio::sync::mpsc;
 
 use super::{Client, ClientError, Stream, encode, path, whole};
+use crate::api::part::sent_name;
 use crate::api::part::{
-    CommitRequest, HostFacts, Lease, LeaseRequest, LeaseView, PrepareRequest, Prepared,
+    CommitRequest, Foreign, HostFacts, ImageFacts, Lease, LeaseRequest, LeaseView, PrepareRequest,
+    Prepared,
 };
 use crate::api::secret::{SecretValues, SecretsChanged};
 use crate::api::{Happening, Removed};
+use crate::images::Saved;
 
 /// How long a host may take to prepare a part, or to write down a blob after its last byte.
 const PREPARE_MAX: Duration = Duration::from_secs(120);
@@ -37,6 +41,15 @@ impl Client {
     /// See [`ClientError`].
     pub async fn host(&self) -> Result<HostFacts, ClientError> {
         self.answer(Method::GET, "/v1/host", Bytes::new()).await
+    }
+
+    /// Containers that say that they are of a federation and are in no record there.
+    ///
+    /// # Errors
+    /// See [`ClientError`].
+    pub async fn foreign(&self, federation: &str) -> Result<Vec<Foreign>, ClientError> {
+        let path = format!("/v1/foreign?{}", encode(&[("federation", federation)]));
+        self.answer(Method::GET, &path, Bytes::new()).await
     }
 
     /// Takes the lease of a federation.
@@ -111,17 +124,71 @@ impl Client {
         file: &Path,
         sent: Arc<AtomicU64>,
     ) -> Result<u64, ClientError> {
-        let opened = File::open(file).map_err(|error| self.unreachable(error))?;
+        let mut opened = File::open(file).map_err(|error| self.unreachable(error))?;
+        let fence = fence.to_string();
+        let query = encode(&[("fence", fence.as_str()), ("federation", name)]);
+        let path = format!("/v1/blobs/{digest}?{query}");
+        // A file that cannot be read ends early, and its digest is then another one.
+        let content = move |out: &mut dyn Write| io::copy(&mut opened, out).map(drop);
+        self.transfer(&path, content, sent).await
+    }
+
+    /// Those of these images that are there, by name or id, and those that were sent for the federation.
+    ///
+    /// # Errors
+    /// See [`ClientError`].
+    pub async fn images(
+        &self,
+        federation: &str,
+        wanted: &[String],
+    ) -> Result<BTreeMap<String, ImageFacts>, ClientError> {
+        let path = format!("/v1/images?{}", encode(&[("federation", federation)]));
+        self.answer(Method::POST, &path, json(&wanted)?).await
+    }
+
+    /// Which layers of an image, the lowest first, are not there.
+    ///
+    /// # Errors
+    /// See [`ClientError`].
+    pub async fn missing_layers(&self, layers: &[String]) -> Result<Vec<String>, ClientError> {
+        self.answer(Method::POST, "/v1/images/layers", json(&layers)?)
+            .await
+    }
+
+    /// Sends an image but for the layers that are there, compressed; gives the bytes that went over the wire. `sent` is told
+    /// as they go.
+    ///
+    /// # Errors
+    /// See [`ClientError`].
+    pub async fn send_image(
+        &self,
+        (name, fence): (&str, u64),
+        id: &str,
+        (image, layers): (Arc<Saved>, BTreeSet<String>),
+        sent: Arc<AtomicU64>,
+    ) -> Result<u64, ClientError> {
+        let fence = fence.to_string();
+        let query = encode(&[("fence", fence.as_str()), ("federation", name)]);
+        let path = format!("/v1/images/{}?{query}", super::escape(id));
+        let called = sent_name(name, id).unwrap_or_default();
+        let content = move |out: &mut dyn Write| image.write_to(&called, &layers, out);
+        self.transfer(&path, content, sent).await
+    }
+
+    /// Sends what is written, compressed.
+    async fn transfer(
+        &self,
+        path: &str,
+        content: impl FnOnce(&mut dyn Write) -> io::Result<()> + Send + 'static,
+        sent: Arc<AtomicU64>,
+    ) -> Result<u64, ClientError> {
         let (pieces, body) = mpsc::channel(PIECES_MAX);
-        tokio::task::spawn_blocking(move || compress(opened, &pieces));
+        tokio::task::spawn_blocking(move || compress(content, pieces));
         let body = Pieces {
             pieces: body,
             sent: Arc::clone(&sent),
         };
-        let fence = fence.to_string();
-        let query = encode(&[("fence", fence.as_str()), ("federation", name)]);
-        let path = format!("/v1/blobs/{digest}?{query}");
-        let (response, _connection) = self.exchange((Method::PUT, &path), body, None).await?;
+        let (response, _connection) = self.exchange((Method::PUT, path), body, None).await?;
         whole(response).await?;
         Ok(sent.load(Ordering::Relaxed))
     }
@@ -223,26 +290,33 @@ fn lease_path(name: &str, query: &[(&str, &str)]) -> String {
     format!("/v1/leases/{}?{}", super::escape(name), encode(query))
 }
 
-/// Compresses a file piece by piece until nobody takes them. A file that cannot be read ends early, and its digest is
-/// then another one.
-fn compress(mut file: File, pieces: &mpsc::Sender<Bytes>) {
-    let mut encoder = GzEncoder::new(Vec::new(), Compression::fast());
-    let mut buffer = vec![0; PIECE_BYTES];
-    let mut next = || -> io::Result<Option<Bytes>> {
-        let count = file.read(&mut buffer)?;
-        if count == 0 {
-            return Ok(None);
-        }
-        encoder.write_all(&buffer[..count])?;
-        Ok(Some(std::mem::take(encoder.get_mut()).into()))
-    };
-    while let Ok(Some(piece)) = next() {
-        if !piece.is_empty() && pieces.blocking_send(piece).is_err() {
-            return;
-        }
+/// Compresses what is written, piece by piece, until nobody takes them. What fails ends early, and is
+/// then not what was promised.
+fn compress(
+    content: impl FnOnce(&mut dyn Write) -> io::Result<()>,
+    pieces: mpsc::Sender<Bytes>,
+) -> io::Result<()> {
+    let mut encoder = GzEncoder::new(Sending(pieces), Compression::fast());
+    let mut buffered = BufWriter::with_capacity(PIECE_BYTES, &mut encoder);
+    content(&mut buffered)?;
+    buffered.flush()?;
+    drop(buffered);
+    encoder.finish().map(drop)
+}
+
+/// Bytes on their way to the network.
+struct Sending(mpsc::Sender<Bytes>);
+
+impl Write for Sending {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        let piece = Bytes::copy_from_slice(bytes);
+        let sent = self.0.blocking_send(piece);
+        sent.map_err(|_| io::Error::from(io::ErrorKind::BrokenPipe))?;
+        Ok(bytes.len())
     }
-    if let Ok(rest) = encoder.finish() {
-        pieces.blocking_send(rest.into()).ok();
+
+    fn flush(&mut self) -> io::Result<()> {
+        Ok(())
     }
 }
 

@@ -52,7 +52,8 @@ pub(crate) enum EngineError {
     },
     /// The engine is older than anything Ictus is tried with.
     #[error(
-        "the Docker engine is too old (version {version}, API {api}): install Docker 20.10 or newer"
+        "the Docker engine is too old (version {version}, API {api}): Docker 20.10 (API 1.41) or newer is needed; upgrade it \
+         (`sudo apt-get install --only-upgrade docker.io`, or docker-ce from docs.docker.com/engine/install)"
     )]
     TooOld {
         /// The engine's version.
@@ -96,6 +97,27 @@ pub(crate) enum EngineError {
         doing: String,
         /// The image.
         image: String,
+    },
+    /// An image is not there, and cannot be pulled either.
+    #[error(
+        "cannot {doing}: image {image} is not on this host, was not found where it is deployed from, and cannot be pulled \
+         ({why}): make it there (`docker build`, `docker pull {image}`), or correct `image:` in the manifest"
+    )]
+    ImageNowhere {
+        /// What it was asked.
+        doing: String,
+        /// The image.
+        image: String,
+        /// Why it cannot be pulled.
+        why: String,
+    },
+    /// An image cannot be built.
+    #[error("{what}{words}")]
+    Build {
+        /// What went wrong.
+        what: String,
+        /// The last lines of the build, each on a line of its own.
+        words: String,
     },
     /// The image is for another processor.
     #[error(

@@ -349,7 +349,8 @@ async fn an_engine_that_is_too_old_is_refused() {
     let old = Engine::connect_to(&path).await.unwrap_err().to_string();
     assert_eq!(
         old,
-        "the Docker engine is too old (version 19.03.15, API 1.40): install Docker 20.10 or newer"
+        "the Docker engine is too old (version 19.03.15, API 1.40): Docker 20.10 (API 1.41) or newer is needed; upgrade it \
+         (`sudo apt-get install --only-upgrade docker.io`, or docker-ce from docs.docker.com/engine/install)"
     );
     assert!(is_new_enough("1.41") && is_new_enough("2.0"));
     assert!(!is_new_enough("1.9") && !is_new_enough("") && !is_new_enough("x.y"));

@@ -174,10 +174,7 @@ impl Contained {
                 spec.program = PROGRAM.into();
                 provide(&engine, program, &self.labels).await?
             }
-            Source::Image(image) => {
-                self.take_over(&engine, image, &mut spec).await?;
-                image.clone()
-            }
+            Source::Image(image) => self.take_over(&engine, image, &mut spec).await?,
         };
         let text = serde_json::to_vec_pretty(&spec).map_err(|error| failed(path, error.into()))?;
         fs::write(path, text).map_err(|error| failed(path, error))?;
@@ -218,16 +215,18 @@ impl Contained {
         remove_directory(&self.socket_directory);
     }
 
-    /// What an image executes comes before the arguments that a federate gets; its environment before the manifest's.
+    /// What an image executes comes before the arguments that a federate gets; its environment before the manifest's. Gives
+    /// the name by which a container is made from it.
     async fn take_over(
         &self,
         engine: &Engine,
         image: &str,
         spec: &mut Spec,
-    ) -> Result<(), ContainerError> {
+    ) -> Result<String, ContainerError> {
         let doing = || format!("create container `{}`", self.name);
-        let found = engine.inspect_image(image).await?;
-        let found = found.ok_or_else(|| EngineError::ImageMissing {
+        let federation = &self.labels[label::FEDERATION];
+        let found = engine.resolve(federation, image).await?;
+        let (name, found) = found.ok_or_else(|| EngineError::ImageMissing {
             doing: doing(),
             image: image.to_owned(),
         })?;
@@ -252,7 +251,7 @@ impl Contained {
         if !found.workdir.is_empty() {
             spec.cwd = found.workdir.into();
         }
-        Ok(())
+        Ok(name)
     }
 
     fn container_spec(&self, image: String, executable: &Path, spec: &Path) -> ContainerSpec {
@@ -447,11 +446,8 @@ pub(crate) async fn prepare(run: &Run<'_>, members: &[MemberId]) -> Result<(), C
                 .map(drop)?,
             Source::Image(image) => {
                 let doing = format!("prepare {}", contained.labels[label::MEMBER]);
-                let missing = || EngineError::ImageMissing {
-                    doing,
-                    image: image.clone(),
-                };
-                engine.inspect_image(image).await?.ok_or_else(missing)?;
+                let federation = &contained.labels[label::FEDERATION];
+                engine.keep(&doing, (federation, image)).await?;
             }
         }
     }

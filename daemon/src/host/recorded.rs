@@ -127,7 +127,7 @@ impl Host {
         needed
     }
 
-    fn history(&self, name: &str) -> History {
+    pub(super) fn history(&self, name: &str) -> History {
         History::new(Directory::of(&self.paths().federations(), name).history())
     }
 }

@@ -1,6 +1,8 @@
 //! The routes of a host's part; see [`crate::api::part`].
 
+use std::collections::BTreeMap;
 use std::io::{self, Read};
+use std::time::Duration;
 
 use axum::Router;
 use axum::body::{Body, Bytes};
@@ -11,9 +13,11 @@ use futures_util::StreamExt;
 use serde::Deserialize;
 use serde::de::DeserializeOwned;
 use tokio::sync::mpsc;
+use tokio::time::timeout;
 
 use crate::api::part::{
-    CommitRequest, HostFacts, Lease, LeaseRequest, LeaseView, PrepareRequest, Prepared,
+    CommitRequest, Foreign, HostFacts, ImageFacts, Lease, LeaseRequest, LeaseView, PrepareRequest,
+    Prepared,
 };
 use crate::api::secret::{SecretValues, SecretsChanged};
 use crate::api::{ApiError, ErrorCode};
@@ -26,16 +30,23 @@ use super::{JsonLines, StarterGuard, bad_request, pass_until_end, stream};
 
 /// Pieces of a blob that wait for the disk.
 const PIECES_MAX: usize = 16;
+/// How long giving images up may take.
+const COLLECTING_MAX: Duration = Duration::from_secs(5);
 
 /// The routes.
 pub(super) fn router() -> Router<Host> {
     let lease = post(take).put(renew).delete(release);
     // A blob is written as it comes, and may be of any size.
     let blob = put(write_blob).layer(DefaultBodyLimit::disable());
+    let image = put(load_image).layer(DefaultBodyLimit::disable());
     Router::new()
         .route("/v1/host", get(host_facts))
+        .route("/v1/foreign", get(foreign))
         .route("/v1/leases", get(leases))
         .route("/v1/leases/{name}", lease)
+        .route("/v1/images", post(images))
+        .route("/v1/images/layers", post(missing_layers))
+        .route("/v1/images/{id}", image)
         .route("/v1/blobs", post(missing))
         .route("/v1/blobs/{digest}", blob)
         .route("/v1/federations/{name}/commit", post(commit))
@@ -68,6 +79,18 @@ async fn host_facts(State(host): State<Host>) -> Json<HostFacts> {
     Json(facts::of_this_host(host.paths(), docker))
 }
 
+#[derive(Deserialize)]
+struct ForeignQuery {
+    federation: String,
+}
+
+async fn foreign(
+    State(host): State<Host>,
+    Query(query): Query<ForeignQuery>,
+) -> Json<Vec<Foreign>> {
+    Json(host.foreign(&query.federation).await)
+}
+
 async fn leases(State(host): State<Host>) -> Json<Vec<LeaseView>> {
     Json(host.lease_views())
 }
@@ -98,6 +121,8 @@ async fn release(
         (Some(fence), None) => {
             host.release_lease(&name, fence)?;
             host.collect_blobs();
+            // An engine that does not answer keeps nobody waiting.
+            timeout(COLLECTING_MAX, host.collect_images()).await.ok();
             Ok(Json(None))
         }
         (None, Some(by)) => host.break_lease(&name, &by).map(Json),
@@ -108,6 +133,42 @@ async fn release(
 async fn missing(State(host): State<Host>, body: Bytes) -> Result<Json<Vec<String>>, ApiError> {
     let digests: Vec<String> = parse(&body)?;
     host.missing_blobs(&digests).map(Json)
+}
+
+#[derive(Deserialize)]
+struct ImagesQuery {
+    federation: String,
+}
+
+async fn images(
+    State(host): State<Host>,
+    Query(query): Query<ImagesQuery>,
+    body: Bytes,
+) -> Result<Json<BTreeMap<String, ImageFacts>>, ApiError> {
+    let wanted: Vec<String> = parse(&body)?;
+    Ok(Json(host.images(&query.federation, &wanted).await))
+}
+
+async fn missing_layers(
+    State(host): State<Host>,
+    body: Bytes,
+) -> Result<Json<Vec<String>>, ApiError> {
+    let layers: Vec<String> = parse(&body)?;
+    host.missing_layers(&layers).await.map(Json)
+}
+
+async fn load_image(
+    State(host): State<Host>,
+    Path(id): Path<String>,
+    Query(query): Query<BlobQuery>,
+    body: Body,
+) -> Result<Json<()>, ApiError> {
+    host.check_fence(&query.federation, Some(query.fence))?;
+    let pieces = body
+        .into_data_stream()
+        .map(|piece| piece.map_err(io::Error::other));
+    let loaded = host.load_image(&query.federation, &id, pieces).await;
+    loaded.map(Json)
 }
 
 async fn write_blob(

@@ -373,13 +373,13 @@ async fn too_many_processes_are_named_as_the_cause() {
 async fn an_image_that_is_not_there_is_named() {
     let Some(rig) = Rig::new() else { return };
     let mut request = rig.request(&[("a", ""), ("b", "")]);
-    request.federates[1].needs.image = Some("no-such-image:1".to_owned());
+    request.federates[1].needs.image = Some("127.0.0.1:1/no-such-image:1".to_owned());
     let failure = rig.fails(&request).await;
     assert_eq!(failure.member.as_deref(), Some("b"));
     assert!(
         failure
             .what
-            .contains("image no-such-image:1 is not on this host"),
+            .contains("image 127.0.0.1:1/no-such-image:1 is not on this host"),
         "{}",
         failure.what
     );
@@ -440,11 +440,12 @@ async fn images_are_made_before_anything_runs() {
         request: rig.request(&[("a", ""), ("b", "")]),
         secrets: SecretValues::default(),
     };
-    prepare.request.federates[1].needs.image = Some("no-such-image:1".to_owned());
+    prepare.request.federates[1].needs.image = Some("127.0.0.1:1/no-such-image:1".to_owned());
     let refused = world.client.prepare((name, fence), &prepare).await;
     let why = refused.unwrap_err().to_string();
     assert!(
-        why.contains("host `here`") && why.contains("image no-such-image:1 is not on this host"),
+        why.contains("host `here`")
+            && why.contains("image 127.0.0.1:1/no-such-image:1 is not on this host"),
         "{why}"
     );
     prepare.request = rig.request(&[("a", ""), ("b", "")]);

@@ -340,6 +340,7 @@ impl Apply {
         let next = match operation {
             Operation::CommitRti | Operation::Commit => Phase::Committing,
             Operation::SendBlob { .. }
+            | Operation::SendImage { .. }
             | Operation::StopOld { .. }
             | Operation::RemoveOld { .. }
             | Operation::Prepare { .. } => Phase::Preparing,
@@ -512,6 +513,7 @@ impl Apply {
                 Operation::RemovePart { .. } | Operation::StopPart { .. } => true,
                 Operation::Lease
                 | Operation::SendBlob { .. }
+                | Operation::SendImage { .. }
                 | Operation::StopOld { .. }
                 | Operation::RemoveOld { .. }
                 | Operation::Prepare { .. }

@@ -54,6 +54,45 @@ pub struct DesiredHost {
     pub needs: BTreeMap<String, Needs>,
     /// The program files that have to be there, by digest; empty for this machine.
     pub blobs: Vec<Blob>,
+    /// The images that have to be there.
+    #[serde(default)]
+    pub images: Vec<Image>,
+}
+
+/// An image that a host needs.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Image {
+    /// As people call it.
+    pub name: String,
+    /// Its id where it is deployed from; absent when it is not there, and the host has it or pulls it.
+    pub id: Option<String>,
+    /// The machine that it is for, as Rust names it, when that is known.
+    pub arch: Option<String>,
+    /// Its size, when that is known.
+    pub bytes: u64,
+    /// The federates that run in it.
+    pub federates: Vec<String>,
+}
+
+impl Image {
+    /// What a host is asked for: the id, or the name.
+    #[must_use]
+    pub fn asked_for(&self) -> &str {
+        self.id.as_ref().unwrap_or(&self.name)
+    }
+}
+
+/// What is known of a federate's image where it is deployed from.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct ImageFile {
+    /// As people call it.
+    pub name: String,
+    /// Its id; absent when it is not there.
+    pub id: Option<String>,
+    /// The machine that it is for, as Rust names it.
+    pub arch: Option<String>,
+    /// Its size.
+    pub bytes: u64,
 }
 
 /// A program file that a host needs.
@@ -146,6 +185,39 @@ impl Desired {
         )
     }
 
+    /// Takes over what is known of the images of federates, by federate: another id is another program.
+    #[must_use]
+    pub fn with_images(mut self, images: &BTreeMap<String, ImageFile>) -> Self {
+        for host in self.hosts.values_mut() {
+            for federate in &host.federates {
+                let Some(image) = images.get(federate) else {
+                    continue;
+                };
+                let same = |known: &&mut Image| known.name == image.name && known.id == image.id;
+                if let Some(known) = host.images.iter_mut().find(same) {
+                    known.federates.push(federate.clone());
+                    continue;
+                }
+                host.images.push(Image {
+                    name: image.name.clone(),
+                    id: image.id.clone(),
+                    arch: image.arch.clone(),
+                    bytes: image.bytes,
+                    federates: vec![federate.clone()],
+                });
+            }
+        }
+        for (federate, image) in images {
+            let asked_for = image.id.as_ref().unwrap_or(&image.name);
+            let facet = short(&json!({ "file": null, "image": asked_for }));
+            self.facets
+                .insert(format!("federate/{federate}/program"), facet);
+        }
+        let whole = json!({ "federation": self.federation, "facets": self.facets });
+        self.digest = digest(&whole);
+        self
+    }
+
     /// Federates on all hosts.
     #[must_use]
     pub fn federates(&self) -> usize {
@@ -164,7 +236,7 @@ fn program_files(
     }
     let mut files = BTreeMap::new();
     let runs = checked.federates.iter();
-    for run in runs.filter(|run| run.needs.image.is_none()) {
+    for run in runs.filter(|run| !run.needs.has_image()) {
         let path = &run.executable;
         if files.contains_key(path) {
             continue;
@@ -198,6 +270,7 @@ fn hosts(
             needs: needs
                 .map(|run| (run.name.clone(), without_sources(&run.needs)))
                 .collect(),
+            images: Vec::new(),
             blobs: match spec.way {
                 Way::Local => Vec::new(),
                 Way::Ssh { .. } => blobs(runs(), files),
@@ -223,7 +296,7 @@ fn blobs<'a>(
     files: &BTreeMap<PathBuf, ProgramFile>,
 ) -> Vec<Blob> {
     let mut blobs: BTreeMap<&str, Blob> = BTreeMap::new();
-    for run in runs.filter(|run| run.needs.image.is_none()) {
+    for run in runs.filter(|run| !run.needs.has_image()) {
         let Some(file) = files.get(&run.executable) else {
             continue;
         };
@@ -275,6 +348,8 @@ fn facets(
         let mut needs = take(&mut run_as, "needs");
         // Where a value comes from is the operator's business, its name is the federate's.
         take(&mut needs, "secrets");
+        // What is built says what it is by its id.
+        take(&mut needs, "build");
         take(&mut run_as, "executable");
         let secrets: BTreeSet<&String> = run.needs.secrets.keys().collect();
         let program = files.get(&run.executable).map(|file| &file.digest);
@@ -294,11 +369,15 @@ fn facets(
             json!(placement.federates.get(index).copied().and_then(host)),
         );
     }
-    let short = |value: &Value| digest(value).chars().take(FACET_DIGITS).collect();
     Ok(all
         .iter()
         .map(|(key, value)| (key.clone(), short(value)))
         .collect())
+}
+
+/// The digest of a facet.
+fn short(value: &Value) -> String {
+    digest(value).chars().take(FACET_DIGITS).collect()
 }
 
 /// Takes a key out of an object.

@@ -1,6 +1,7 @@
 //! What a host says about itself and about the federation.
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 
@@ -34,8 +35,14 @@ pub struct Reached {
     pub secrets_changed: BTreeMap<String, BTreeSet<String>>,
     /// Free bytes where blobs are kept.
     pub disk_free: u64,
+    /// Where that is on the host; empty when it does not say.
+    #[serde(default)]
+    pub state: PathBuf,
     /// Digests of the blobs that are there; those that nobody asked for may be missing.
     pub blobs: BTreeSet<String>,
+    /// What each image that was asked for and is there is for, as Rust names it.
+    #[serde(default)]
+    pub images: BTreeMap<String, String>,
     /// The federation's last run there; absent only when the host says that there is none.
     pub run: Result<Option<Run>, NewerRecord>,
     /// Who holds the federation's lease there; absent when nobody does, or whoever asks.

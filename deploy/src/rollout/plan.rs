@@ -110,7 +110,9 @@ impl Plan {
     pub fn bytes(&self) -> u64 {
         let mut sum = 0;
         for step in &self.steps {
-            if let Operation::SendBlob { bytes, .. } = &step.operation {
+            if let Operation::SendBlob { bytes, .. } | Operation::SendImage { bytes, .. } =
+                &step.operation
+            {
                 sum += bytes;
             }
         }
@@ -379,6 +381,19 @@ fn unsuited(host: &str, wanted: &DesiredHost, reached: &Reached) -> Vec<Reason> 
         program: blob.arch.clone(),
         federates: blob.federates.clone(),
     }));
+    for image in &wanted.images {
+        let there = reached.images.get(image.asked_for());
+        let arch = image.arch.as_ref().or(there);
+        if let Some(arch) = arch.filter(|arch| **arch != reached.arch) {
+            reasons.push(Reason::ImageArchitecture {
+                host: host.to_owned(),
+                arch: reached.arch.clone(),
+                image: image.name.clone(),
+                found: arch.clone(),
+                federates: image.federates.clone(),
+            });
+        }
+    }
     match (wanted.engine, &reached.docker) {
         (Engine::Docker, Err(why)) => reasons.push(Reason::Engine {
             host: host.to_owned(),
@@ -401,6 +416,7 @@ fn unsuited(host: &str, wanted: &DesiredHost, reached: &Reached) -> Vec<Reason> 
     if needed > reached.disk_free {
         reasons.push(Reason::Disk {
             host: host.to_owned(),
+            path: reached.state.clone(),
             free: reached.disk_free,
             needed,
         });
@@ -428,6 +444,10 @@ impl<'a> Graph<'a> {
         let id = StepId(self.steps.len());
         let limit_ms = match &operation {
             Operation::SendBlob { bytes, .. } => CALL_LIMIT_MS + bytes / SLOWEST_LINK * 1000,
+            // Taken out of one engine, loaded into another, and once more when layers are not there after all.
+            Operation::SendImage { bytes, .. } => {
+                PREPARE_LIMIT_MS + bytes / SLOWEST_LINK * 1000 * 2
+            }
             Operation::StopOld { .. } => self.stop_limit_ms,
             Operation::Prepare { .. } => PREPARE_LIMIT_MS,
             Operation::Lease
@@ -478,6 +498,20 @@ impl<'a> Graph<'a> {
                     "not there: the program of {}",
                     listed("federate", &blob.federates)
                 );
+                needs = vec![self.add(host, operation, &cause, &needs)];
+            }
+            for image in &wanted.images {
+                let there = there.is_some_and(|it| it.images.contains_key(image.asked_for()));
+                // One that is nowhere is pulled by the host.
+                let (Some(id), false) = (&image.id, there) else {
+                    continue;
+                };
+                let operation = Operation::SendImage {
+                    image: id.clone(),
+                    bytes: image.bytes,
+                };
+                let federates = listed("federate", &image.federates);
+                let cause = format!("not there: image {} of {federates}", image.name);
                 needs = vec![self.add(host, operation, &cause, &needs)];
             }
             if needs != after {

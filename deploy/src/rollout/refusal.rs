@@ -1,6 +1,7 @@
 //! Why nothing can be planned.
 
 use std::fmt;
+use std::path::PathBuf;
 
 use super::plan::listed;
 
@@ -43,6 +44,23 @@ pub enum Reason {
         /// The program's.
         program: String,
         /// Who executes it.
+        federates: Vec<String>,
+    },
+    /// An image is for another machine.
+    #[error(
+        "host `{host}` is {arch}, but image {image} of {federates} is for {found}",
+        federates = listed("federate", federates)
+    )]
+    ImageArchitecture {
+        /// The host.
+        host: String,
+        /// Its machine.
+        arch: String,
+        /// The image.
+        image: String,
+        /// The image's.
+        found: String,
+        /// Who runs in it.
         federates: Vec<String>,
     },
     /// It cannot run containers.
@@ -109,10 +127,15 @@ pub enum Reason {
         fix: String,
     },
     /// What is sent does not fit.
-    #[error("host `{host}` has {free} bytes free, but {needed} bytes are to be sent")]
+    #[error(
+        "host `{host}` has {free} bytes free at {path}, but {needed} bytes are to be sent",
+        path = path.display()
+    )]
     Disk {
         /// The host.
         host: String,
+        /// Where it would be kept.
+        path: PathBuf,
         /// Free bytes.
         free: u64,
         /// Bytes to send.
@@ -128,6 +151,7 @@ impl Reason {
             Self::Unreachable { host, .. }
             | Self::NotAsked { host, .. }
             | Self::Architecture { host, .. }
+            | Self::ImageArchitecture { host, .. }
             | Self::Engine { host, .. }
             | Self::DaemonOlder { host, .. }
             | Self::DaemonNewer { host, .. }
@@ -151,6 +175,9 @@ impl Reason {
             Self::Architecture { arch, .. } => {
                 format!("build the program for {arch}, or place the federate on another host")
             }
+            Self::ImageArchitecture { arch, .. } => {
+                format!("make or pull the image for {arch}, or place the federate on another host")
+            }
             Self::Engine { .. } => {
                 "make Docker usable there, or use `engine: process` for that host".to_owned()
             }
@@ -162,7 +189,10 @@ impl Reason {
                 "wait for it; if whoever held it is gone, `ictus lock break` frees it".to_owned()
             }
             Self::Lacks { fix, .. } => fix.clone(),
-            Self::Disk { host, .. } => format!("free space on `{host}`"),
+            Self::Disk { host, path, .. } => format!(
+                "free space on `{host}` (`df {path}` there), or place federates on another host",
+                path = path.display()
+            ),
         }
     }
 }

@@ -88,6 +88,15 @@ impl Plan {
                 format!("{} {}", short(digest), size(*bytes)),
                 step.cause.clone(),
             ),
+            Operation::SendImage { image, bytes } => (
+                "+ send",
+                format!(
+                    "image {}, up to {}",
+                    short(image.trim_start_matches("sha256:")),
+                    size(*bytes)
+                ),
+                step.cause.clone(),
+            ),
             // Why is said at the head.
             Operation::StopOld { run } => ("- stop", run_words(run), String::new()),
             Operation::RemoveOld { run: Some(run), .. } => {

@@ -40,6 +40,13 @@ pub enum Operation {
         /// Its size.
         bytes: u64,
     },
+    /// Sends an image, but for the layers that are there.
+    SendImage {
+        /// Its id where it is sent from.
+        image: String,
+        /// Its size.
+        bytes: u64,
+    },
     /// Stops the run that is there in order; one that was not begun never will be; one that has ended stays as it is.
     StopOld {
         /// Its id.
@@ -86,6 +93,7 @@ impl Operation {
         match self {
             Self::Lease => "lease",
             Self::SendBlob { .. } => "send_blob",
+            Self::SendImage { .. } => "send_image",
             Self::StopOld { .. } => "stop_old",
             Self::RemoveOld { .. } => "remove_old",
             Self::Prepare { .. } => "prepare",
@@ -105,6 +113,7 @@ impl fmt::Display for Operation {
         f.write_str(match self {
             Self::Lease => "taking the lease",
             Self::SendBlob { .. } => "sending a program",
+            Self::SendImage { .. } => "sending an image",
             Self::StopOld { .. } => "stopping the run that was there",
             Self::RemoveOld { .. } => "removing the run that was there",
             Self::Prepare { .. } => "preparing",

@@ -26,6 +26,8 @@ const WINDOW: u32 = 1 << 20;
 const PACKET: u32 = 32 << 10;
 /// How long the thread sleeps at most.
 const PAUSE: Duration = Duration::from_secs(5);
+/// The same without a channel. A host that asks whether we live (ClientAliveInterval) is not heard then, so it is told.
+const IDLE_PAUSE: Duration = Duration::from_secs(1);
 /// Rounds over all channels before the thread looks at new requests.
 const ROUNDS_MAX: usize = 64;
 
@@ -109,6 +111,7 @@ impl Worker {
     /// A worker for a session that is authenticated.
     pub(super) fn new(session: Session, socket: OwnedFd, link: Arc<Link>) -> Self {
         session.set_blocking(false);
+        session.set_keepalive(false, 1);
         Self {
             session,
             socket,
@@ -223,7 +226,12 @@ impl Worker {
             PollFd::new(&self.socket, flags),
             PollFd::new(&*self.link.bell, PollFlags::IN),
         ];
-        let pause = Timespec::try_from(PAUSE).map_err(|error| error.to_string())?;
+        if !busy && writable(&self.socket) {
+            // That it is lost is seen below.
+            self.session.keepalive_send().ok();
+        }
+        let pause = if busy { PAUSE } else { IDLE_PAUSE };
+        let pause = Timespec::try_from(pause).map_err(|error| error.to_string())?;
         match poll(&mut fds, Some(&pause)) {
             Ok(_) | Err(rustix::io::Errno::INTR) => {}
             Err(error) => return Err(error.to_string()),

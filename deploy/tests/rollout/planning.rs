@@ -1,6 +1,7 @@
 //! What is planned, refused, and shown.
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::path::PathBuf;
 
 use ictus_deploy::gives::{Denied, Gives};
 use ictus_deploy::placement::{Realtime, RealtimePolicy};
@@ -16,6 +17,7 @@ fn names(names: &[&str]) -> Vec<String> {
 
 fn host(engine: Engine, rti: bool, federates: &[&str], blob: (&str, u64)) -> DesiredHost {
     DesiredHost {
+        images: Vec::new(),
         engine,
         rti,
         federates: names(federates),
@@ -71,6 +73,8 @@ fn reached() -> Reached {
         gives: Gives::default(),
         secrets_changed: BTreeMap::new(),
         disk_free: 1 << 40,
+        state: PathBuf::from("/home/robot/.local/state/ictus"),
+        images: BTreeMap::new(),
         blobs: BTreeSet::new(),
         run: Ok(None),
         lease: None,

@@ -1,6 +1,7 @@
 //! Hosts with records, blobs, leases and runs, and a clock.
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::path::PathBuf;
 
 use ictus_deploy::Engine;
 use ictus_deploy::gives::Gives;
@@ -50,6 +51,7 @@ pub(crate) fn desired(hosts: &BTreeSet<String>, program: u32, parameter: u32) ->
     let host = |(index, name): (usize, &String)| {
         let federate = format!("f_{name}");
         let host = DesiredHost {
+            images: Vec::new(),
             engine: Engine::Process,
             rti: index == 0,
             federates: vec![federate.clone()],
@@ -326,6 +328,8 @@ impl World {
             gives: Gives::default(),
             secrets_changed: BTreeMap::new(),
             disk_free: 1 << 30,
+            state: PathBuf::from("/home/robot/.local/state/ictus"),
+            images: BTreeMap::new(),
             blobs: host.blobs.clone(),
             run: Ok(host.run.as_ref().map(|run| told(name, run))),
             lease: lease.map(|lease| Held {
@@ -454,7 +458,7 @@ fn lease(host: &mut Host, now_ms: u64, call: &Call) -> Outcome {
 
 fn change(host: &mut Host, now_ms: u64, call: &Call) -> Result<(), String> {
     match &call.step.operation {
-        Operation::Lease | Operation::AwaitHealthy => {}
+        Operation::Lease | Operation::AwaitHealthy | Operation::SendImage { .. } => {}
         Operation::SendBlob { digest, .. } => {
             host.blobs.insert(digest.clone());
         }

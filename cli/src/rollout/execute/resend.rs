@@ -1,0 +1,63 @@
+//! What was there when a host was looked at, and is not when it prepares: it is sent then.
+
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::sync::atomic::AtomicU64;
+
+use ictusd::api::part::{PrepareRequest, sent_name};
+use ictusd::client::ClientError;
+
+use super::Call;
+use crate::rollout::images::{Images, SendError};
+
+/// What may have to be sent.
+#[derive(Clone, Debug, Default)]
+pub(super) struct Stock {
+    /// Programs by digest.
+    pub(super) files: BTreeMap<String, PathBuf>,
+    pub(super) images: Images,
+}
+
+impl Call {
+    /// Sends programs and images that somebody else's change has removed since, now that the lease keeps them; gives the
+    /// bytes that went over the wire.
+    pub(super) async fn send_again(&self, request: &PrepareRequest) -> Result<u64, SendError> {
+        let (client, key) = (&self.client, (self.federation.as_str(), self.fence));
+        let Some(part) = &request.request.part else {
+            return Ok(0);
+        };
+        let mut sent = 0;
+        let programs: Vec<String> = part.programs.values().cloned().collect();
+        for digest in client.missing_blobs(&programs).await? {
+            if let Some(file) = self.stock.files.get(&digest) {
+                let counter = Arc::new(AtomicU64::new(0));
+                sent += client.send_blob(key, &digest, file, counter).await?;
+            }
+        }
+        let runs = request.request.federates.iter();
+        let runs = runs.filter(|run| part.federates.contains(&run.id));
+        let images = runs.filter_map(|run| run.needs.image.clone());
+        // Only what has an id is here.
+        let mut images: Vec<String> = images
+            .filter(|image| sent_name(key.0, image).is_some())
+            .collect();
+        images.dedup();
+        if images.is_empty() {
+            return Ok(sent);
+        }
+        let there = client.images(key.0, &images).await?;
+        for image in images.iter().filter(|image| !there.contains_key(*image)) {
+            sent += self.stock.images.send(client, key, image).await?.0;
+        }
+        Ok(sent)
+    }
+}
+
+/// What went wrong as a call's.
+pub(super) fn refused(error: SendError) -> Result<String, ClientError> {
+    match error {
+        SendError::Here(what) => Ok(what),
+        SendError::There(error) => Err(error),
+    }
+}

@@ -1,0 +1,99 @@
+//! Images of this host's engine that are asked for, taken, and given up again.
+
+use std::collections::BTreeMap;
+use std::io;
+
+use futures_util::Stream;
+use hyper::body::Bytes;
+use ictus_deploy::image::elf::Architecture;
+
+use crate::api::ApiError;
+use crate::api::ErrorCode;
+use crate::api::part::ImageFacts;
+use crate::docker::{Engine, EngineError, sent_name};
+
+use super::Host;
+
+impl Host {
+    /// Those of these images that are there, or were sent for the federation; none when there is no engine.
+    pub(crate) async fn images(
+        &self,
+        federation: &str,
+        wanted: &[String],
+    ) -> BTreeMap<String, ImageFacts> {
+        let mut there = BTreeMap::new();
+        let Ok(engine) = Engine::connect().await else {
+            return there;
+        };
+        for image in wanted {
+            if let Ok(Some((_, found))) = engine.resolve(federation, image).await {
+                let arch = Architecture::from_docker(&found.architecture);
+                let facts = ImageFacts {
+                    id: found.id,
+                    arch: arch.map_or(found.architecture, |arch| arch.rust_name().to_owned()),
+                };
+                there.insert(image.clone(), facts);
+            }
+        }
+        there
+    }
+
+    /// Those layers of an image that are not there.
+    pub(crate) async fn missing_layers(&self, layers: &[String]) -> Result<Vec<String>, ApiError> {
+        let engine = Engine::connect().await.map_err(|error| failed(&error))?;
+        let missing = engine.missing_layers(layers).await;
+        missing.map_err(|error| failed(&error))
+    }
+
+    /// Takes an image for a federation.
+    pub(crate) async fn load_image(
+        &self,
+        federation: &str,
+        id: &str,
+        pieces: impl Stream<Item = io::Result<Bytes>> + Send + 'static,
+    ) -> Result<(), ApiError> {
+        let Some(name) = sent_name(federation, id) else {
+            return Err(ApiError {
+                code: ErrorCode::BadRequest,
+                message: format!(
+                    "`{}` is no image's id",
+                    id.chars().take(80).collect::<String>()
+                ),
+                known: Vec::new(),
+            });
+        };
+        let engine = Engine::connect().await.map_err(|error| failed(&error))?;
+        let loaded = engine.load_stream(&name, pieces).await;
+        loaded.map_err(|error| failed(&error))
+    }
+
+    /// Gives up images that were sent and that no run of this host needs; those of a change that is under way are needed.
+    pub(crate) async fn collect_images(&self) {
+        if !self.lease_views().is_empty() {
+            return;
+        }
+        let mut needed = Vec::new();
+        for name in self.names() {
+            let request = self.directory(&name).read_request().ok();
+            let runs = request.into_iter().flat_map(|request| request.federates);
+            let mut images = self.history(&name).images();
+            images.extend(runs.filter_map(|run| run.needs.image));
+            needed.extend(images.iter().filter_map(|image| sent_name(&name, image)));
+        }
+        // Where there is no engine there is no image either.
+        let Ok(engine) = Engine::connect().await else {
+            return;
+        };
+        if let Err(error) = engine.remove_sent(&needed).await {
+            tracing::warn!(%error, "images were not removed");
+        }
+    }
+}
+
+fn failed(error: &EngineError) -> ApiError {
+    ApiError {
+        code: ErrorCode::Failed,
+        message: error.to_string(),
+        known: Vec::new(),
+    }
+}

@@ -1,0 +1,155 @@
+//! `ictus up` killed at each boundary of its phases: run again it converges, and `down --purge` leaves nothing.
+
+#![expect(
+    clippy::unwrap_used,
+    clippy::panic,
+    reason = "a test stops at the first surprise"
+)]
+
+use std::fs;
+use std::io::{BufRead, BufReader};
+use std::os::unix::process::ExitStatusExt;
+use std::process::Stdio;
+
+use ictus_tests::kill;
+use ictus_tests::rig::{Host, Rig};
+
+use rustix::process::{Pid, Signal, kill_process};
+
+use super::Scenario;
+use super::operator::Operator;
+use super::rows::{pair, ticking};
+
+/// In this order.
+pub(crate) const SCENARIOS: &[Scenario] = &[
+    (
+        "an_up_killed_at_each_phase_converges_when_run_again",
+        an_up_killed_at_each_phase_converges_when_run_again,
+    ),
+    (
+        "a_program_that_is_removed_after_it_was_seen_is_sent_again",
+        a_program_that_is_removed_after_it_was_seen_is_sent_again,
+    ),
+];
+
+/// Where a start is cut off: the words that its last line begins with, how many such lines there are, and whether anything
+/// may run already.
+const BOUNDARIES: &[(&str, usize, bool)] = &[
+    ("planned ", 1, false),
+    ("leased ", 1, false),
+    ("sent ", 2, false),
+    ("prepared ", 2, false),
+    ("started    the RTI", 1, true),
+    ("running ", 1, true),
+];
+
+fn an_up_killed_at_each_phase_converges_when_run_again(rig: &Rig) {
+    let hosts = &rig.hosts()[..2];
+    let operator = Operator::new(rig);
+    operator.add(hosts);
+    // One of each engine.
+    let engines = [", engine: docker", ""];
+    let file = operator.manifest("pair.yaml", &pair(hosts, engines, &ticking(&operator)));
+    for (index, (line, count, may_run)) in BOUNDARIES.iter().enumerate() {
+        cut_off(&operator, &file, line, *count);
+        if !may_run {
+            for host in hosts {
+                assert_eq!(members(host), "", "after `{line}` on {}", host.name);
+            }
+        }
+        // Whoever had the lease is gone. Once it is waited for until it ends; otherwise it is taken away.
+        if index != 1 {
+            operator.ok(&["lock", "break", &file]);
+        }
+        let again = operator.ok(&["up", &file]);
+        let waited = again.contains("waiting for it");
+        assert_eq!(waited, index == 1, "after `{line}`: {again}");
+        let parts = operator.parts(&file);
+        assert_eq!(parts.len(), 2, "after `{line}`: {parts:?}");
+        assert!(
+            parts.iter().all(|part| part["state"] == "running"),
+            "after `{line}`: {parts:?}"
+        );
+        operator.ok(&["down", &file, "--purge"]);
+        for host in hosts {
+            let left = host.exec(&["find", "/home/robot/.local/state/ictus", "-type", "f"]);
+            let left: Vec<_> = left.lines().filter(|it| !it.contains("/run/")).collect();
+            assert!(left.is_empty(), "after `{line}` on {}: {left:?}", host.name);
+            assert_eq!(members(host), "", "after `{line}` on {}", host.name);
+            let images = host.docker(&["images", "-q"]);
+            assert_eq!(images, "", "after `{line}` on {}", host.name);
+        }
+    }
+    operator.remove(hosts);
+}
+
+/// Somebody else's change may remove what nobody seems to need, until the lease is taken.
+fn a_program_that_is_removed_after_it_was_seen_is_sent_again(rig: &Rig) {
+    let hosts = &rig.hosts()[..1];
+    let operator = Operator::new(rig);
+    operator.add(hosts);
+    let file = operator.manifest("pair.yaml", &pair(hosts, [""; 2], &ticking(&operator)));
+    // It is there and nobody needs it.
+    cut_off(&operator, &file, "sent ", 1);
+    operator.ok(&["lock", "break", &file]);
+    let mut up = operator.command(&["up", &file]);
+    let mut up = up
+        .stdout(Stdio::null())
+        .stderr(Stdio::piped())
+        .spawn()
+        .unwrap();
+    let mut said = BufReader::new(up.stderr.take().unwrap()).lines();
+    let planned = said.find(|told| told.as_ref().unwrap().starts_with("planned "));
+    assert!(planned.is_some());
+    let pid = Pid::from_raw(child_of(up.id())).unwrap();
+    kill_process(pid, Signal::STOP).unwrap();
+    let blobs = "/home/robot/.local/state/ictus/blobs";
+    hosts[0].exec(&["rm", "-r", blobs]);
+    kill_process(pid, Signal::CONT).unwrap();
+    let rest: Vec<String> = said.map(Result::unwrap).collect();
+    assert!(up.wait().unwrap().success(), "{rest:?}");
+    assert!(
+        rest.iter().any(|told| told.starts_with("sent ")),
+        "{rest:?}"
+    );
+    operator.ok(&["down", &file, "--purge"]);
+    operator.remove(hosts);
+}
+
+/// The process that a `timeout` runs.
+fn child_of(timeout: u32) -> i32 {
+    let path = format!("/proc/{timeout}/task/{timeout}/children");
+    fs::read_to_string(path).unwrap().trim().parse().unwrap()
+}
+
+/// Starts a federation and kills whoever starts it as soon as it has said so many lines that begin so.
+fn cut_off(operator: &Operator<'_>, manifest: &str, line: &str, count: usize) {
+    let mut up = operator.command(&["up", manifest]);
+    let mut up = up
+        .stdout(Stdio::null())
+        .stderr(Stdio::piped())
+        .spawn()
+        .unwrap();
+    let mut said = Vec::new();
+    for told in BufReader::new(up.stderr.take().unwrap()).lines() {
+        said.push(told.unwrap());
+        if said.iter().filter(|told| told.starts_with(line)).count() == count {
+            break;
+        }
+    }
+    let found = said.iter().filter(|told| told.starts_with(line)).count();
+    assert_eq!(found, count, "{}", said.join("\n"));
+    kill(child_of(up.id()));
+    let status = up.wait().unwrap();
+    // `timeout` ends as its child did.
+    assert_eq!(status.signal(), Some(9), "it was not killed: {said:?}");
+}
+
+/// The federates and the RTI that run on a host.
+fn members(host: &Host) -> String {
+    let output = host.output(&["pgrep", "-af", "([-]-federate|ictusd? [r]ti )"]);
+    match output.status.code() {
+        Some(0 | 1) => String::from_utf8(output.stdout).unwrap(),
+        _ => panic!("{}", ictus_tests::said(&output)),
+    }
+}
