@@ -199,34 +199,13 @@ impl Saved {
             image: image.clone(),
             what: what.to_owned(),
         };
-        let (mut places, mut links) = (BTreeMap::new(), BTreeMap::new());
         let unreadable = |source| ImagesError::Io {
             path: file.path().to_path_buf(),
             source,
         };
         let opened = || File::open(file.path());
-        let mut archive = Archive::new(opened().map_err(unreadable)?);
-        for entry in archive.entries().map_err(unreadable)? {
-            let entry = entry.map_err(unreadable)?;
-            let path = plain(&entry.path().map_err(unreadable)?);
-            match entry.link_name().map_err(unreadable)? {
-                Some(to) if entry.header().entry_type() == EntryType::Symlink => {
-                    let beside = Path::new(&path).parent().unwrap_or(Path::new(""));
-                    links.insert(path.clone(), plain(&beside.join(to)));
-                }
-                Some(to) => {
-                    links.insert(path, plain(&to));
-                }
-                None => {
-                    places.insert(path, (entry.raw_file_position(), entry.size()));
-                }
-            }
-        }
-        let place = |name: &str| {
-            let name = plain(Path::new(name));
-            let target = links.get(&name).unwrap_or(&name);
-            places.get(target).copied()
-        };
+        let contents = Contents::of(opened().map_err(unreadable)?).map_err(unreadable)?;
+        let place = |name: &str| contents.place(name);
         let whole = |name: &str| -> Result<Vec<u8>, ImagesError> {
             let (at, length) = place(name).ok_or_else(|| strange("a file of it is missing"))?;
             if length > DESCRIPTION_BYTES_MAX {
@@ -306,6 +285,45 @@ impl Saved {
     #[must_use]
     pub fn layers(&self) -> &[String] {
         &self.layers
+    }
+}
+
+/// Where the files of an archive are in it, by path.
+#[derive(Debug, Default)]
+struct Contents {
+    places: BTreeMap<String, (u64, u64)>,
+    links: BTreeMap<String, String>,
+}
+
+impl Contents {
+    fn of(archive: File) -> io::Result<Self> {
+        let mut contents = Self::default();
+        for entry in Archive::new(archive).entries()? {
+            let entry = entry?;
+            let path = plain(&entry.path()?);
+            match entry.link_name()? {
+                Some(to) if entry.header().entry_type() == EntryType::Symlink => {
+                    let beside = Path::new(&path).parent().unwrap_or(Path::new(""));
+                    let to = plain(&beside.join(to));
+                    contents.links.insert(path, to);
+                }
+                Some(to) => {
+                    contents.links.insert(path, plain(&to));
+                }
+                None => {
+                    let place = (entry.raw_file_position(), entry.size());
+                    contents.places.insert(path, place);
+                }
+            }
+        }
+        Ok(contents)
+    }
+
+    /// First byte and length of a file, or of what a link names.
+    fn place(&self, path: &str) -> Option<(u64, u64)> {
+        let path = plain(Path::new(path));
+        let target = self.links.get(&path).unwrap_or(&path);
+        self.places.get(target).copied()
     }
 }
 

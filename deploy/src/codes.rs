@@ -206,7 +206,7 @@ pub(crate) const CODES: &[(&str, &str)] = &[
         "F036",
         "What a federate needs from its host cannot be given so: a path that is not absolute or has a `..`, \
          a volume over what is Ictus' own (`/ictus`, `/.ictus`, `/app`, `/`), a user or image whose name \
-         has no such form, too little memory, a processor named twice.",
+         has no such form, a folder to build without its Dockerfile, too little memory, a processor named twice.",
     ),
     (
         "F037",

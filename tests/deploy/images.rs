@@ -48,7 +48,11 @@ impl Workshop {
     fn new(operator: &Operator<'_>) -> Self {
         let folder = operator.home.path().join("viewer");
         fs::create_dir(&folder).unwrap();
-        let text = manifest(None, &program_line(operator), "class: Counter");
+        let text = manifest(
+            None,
+            &program_line(operator),
+            "class: Faulty, parameters: { at: 0 }",
+        );
         let planned = operator.run(&[
             "plan",
             &operator.manifest("alone.yaml", &text),

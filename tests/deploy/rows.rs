@@ -9,6 +9,7 @@
 use std::fs;
 use std::os::unix::fs::PermissionsExt;
 use std::path::PathBuf;
+use std::sync::Once;
 
 use ictus_tests::rig::{Host, Rig};
 use ictus_tests::root;
@@ -49,16 +50,15 @@ const STATE: &str = "/home/robot/.local/state/ictus";
 
 /// A federate that ticks and one that counts, until they are stopped: a static program, built once.
 pub(crate) fn ticking(operator: &Operator<'_>) -> String {
-    let built = program("canary");
-    let canary = root().join("tests/canary");
-    let package = format!("package: {}", canary.display());
-    if !built.exists() {
+    static BUILT: Once = Once::new();
+    BUILT.call_once(|| {
         // Only what travels is built static.
         let hosts = operator.rig.hosts();
+        let package = format!("package: {}", root().join("tests/canary").display());
         let text = pair(&hosts[..1], [", engine: docker", ""], &package);
         operator.ok(&["check", &operator.manifest("build.yaml", &text)]);
-    }
-    format!("binary: {}", built.display())
+    });
+    format!("binary: {}", program("canary").display())
 }
 
 /// A manifest of two federates on one or two hosts, each host with these keys besides.

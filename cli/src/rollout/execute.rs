@@ -28,7 +28,7 @@ mod begin;
 mod resend;
 mod stages;
 
-use resend::{Stock, refused};
+use resend::Stock;
 use stages::Stages;
 
 /// How long a lease lasts without renewal: who is gone for so long has gone.
@@ -544,12 +544,7 @@ impl Call {
                 let sent = client.send_blob(key, digest, file, counter).await?;
                 Ok((Outcome::Done, Effect::Sent(sent)))
             }
-            Operation::SendImage { image, .. } => {
-                match self.stock.images.send(client, key, image).await {
-                    Ok(sent) => Ok((Outcome::Done, Effect::SentLayers(sent))),
-                    Err(error) => refused(error).map(|what| (failed(&what), Effect::Nothing)),
-                }
-            }
+            Operation::SendImage { image, .. } => self.send_image(image).await,
             Operation::StopOld { run } | Operation::StopPart { run } => {
                 if self.is_there(run).await? {
                     let mut stream = client.stop_part(key, self.kill).await?;
@@ -574,24 +569,7 @@ impl Call {
                 }
                 done
             }
-            Operation::Prepare { .. } => {
-                let Some(request) = &self.request else {
-                    return Ok((failed("there is nothing to prepare"), Effect::Nothing));
-                };
-                let sent = match self.send_again(request).await {
-                    Ok(sent) => sent,
-                    Err(error) => {
-                        return refused(error).map(|what| (failed(&what), Effect::Nothing));
-                    }
-                };
-                client.prepare(key, request).await?;
-                let effect = if sent > 0 {
-                    Effect::Sent(sent)
-                } else {
-                    Effect::Nothing
-                };
-                Ok((Outcome::Done, effect))
-            }
+            Operation::Prepare { .. } => self.prepare().await,
             Operation::CommitRti | Operation::Commit => {
                 let rti = self.rti.filter(|_| *operation == Operation::Commit);
                 let request = CommitRequest {

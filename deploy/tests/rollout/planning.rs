@@ -392,7 +392,8 @@ fn every_refusal_names_host_cause_and_fix() {
         ),
         (
             |it| it.disk_free = 5,
-            "host `nuc` has 5 bytes free, but 3145728 bytes are to be sent; free space on `nuc`",
+            "host `nuc` has 5 bytes free at /home/robot/.local/state/ictus, but 3145728 bytes are to be sent; free space on \
+             `nuc` (`df /home/robot/.local/state/ictus` there), or place federates on another host",
         ),
         (
             |it| {

@@ -8,7 +8,7 @@ use std::sync::atomic::AtomicU64;
 use ictusd::api::part::{PrepareRequest, sent_name};
 use ictusd::client::ClientError;
 
-use super::Call;
+use super::{Call, Effect, Outcome, failed};
 use crate::rollout::images::{Images, SendError};
 
 /// What may have to be sent.
@@ -20,9 +20,36 @@ pub(super) struct Stock {
 }
 
 impl Call {
+    /// Sends what a host lacks of an image.
+    pub(super) async fn send_image(&self, image: &str) -> Result<(Outcome, Effect), ClientError> {
+        let key = (self.federation.as_str(), self.fence);
+        match self.stock.images.send(&self.client, key, image).await {
+            Ok(sent) => Ok((Outcome::Done, Effect::SentLayers(sent))),
+            Err(error) => refused(error),
+        }
+    }
+
+    /// Has the host prepare its part.
+    pub(super) async fn prepare(&self) -> Result<(Outcome, Effect), ClientError> {
+        let Some(request) = &self.request else {
+            return Ok((failed("there is nothing to prepare"), Effect::Nothing));
+        };
+        let sent = match self.send_again(request).await {
+            Ok(sent) => sent,
+            Err(error) => return refused(error),
+        };
+        let key = (self.federation.as_str(), self.fence);
+        self.client.prepare(key, request).await?;
+        let effect = match sent {
+            0 => Effect::Nothing,
+            sent => Effect::Sent(sent),
+        };
+        Ok((Outcome::Done, effect))
+    }
+
     /// Sends programs and images that somebody else's change has removed since, now that the lease keeps them; gives the
     /// bytes that went over the wire.
-    pub(super) async fn send_again(&self, request: &PrepareRequest) -> Result<u64, SendError> {
+    async fn send_again(&self, request: &PrepareRequest) -> Result<u64, SendError> {
         let (client, key) = (&self.client, (self.federation.as_str(), self.fence));
         let Some(part) = &request.request.part else {
             return Ok(0);
@@ -55,9 +82,9 @@ impl Call {
 }
 
 /// What went wrong as a call's.
-pub(super) fn refused(error: SendError) -> Result<String, ClientError> {
+fn refused(error: SendError) -> Result<(Outcome, Effect), ClientError> {
     match error {
-        SendError::Here(what) => Ok(what),
+        SendError::Here(what) => Ok((failed(&what), Effect::Nothing)),
         SendError::There(error) => Err(error),
     }
 }
