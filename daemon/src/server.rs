@@ -17,7 +17,7 @@ use axum::routing::{get, post};
 use hyper::body::Frame;
 use serde::{Deserialize, Serialize};
 use tokio::net::{UnixListener, UnixStream};
-use tokio::sync::{broadcast, mpsc};
+use tokio::sync::{broadcast, mpsc, watch};
 
 use crate::api::secret::StartCall;
 use crate::api::{
@@ -187,7 +187,7 @@ async fn stop(
         Command::Stop
     };
     handle.commands.send(command).await.ok();
-    tokio::spawn(pass_until_end(told, name, lines));
+    tokio::spawn(pass_until_gone(told, name, lines, handle.view));
     Ok(stream(body))
 }
 
@@ -359,7 +359,41 @@ async fn give_way(State(host): State<Host>) -> Json<bool> {
 
 /// Passes a federation's events on until its end, or until nobody listens.
 async fn pass_until_end(mut told: Told, name: String, lines: Sender) {
-    while let Some(happening) = next(&mut told, &lines).await {
+    pass_to_end(&mut told, &name, &lines).await;
+}
+
+/// The same, and until what it leaves is removed. One that has ended before anybody listened tells its end then.
+async fn pass_until_gone(
+    mut told: Told,
+    name: String,
+    lines: Sender,
+    mut view: watch::Receiver<FederationView>,
+) {
+    let mut late = view.clone();
+    tokio::select! {
+        () = pass_to_end(&mut told, &name, &lines) => {}
+        () = gone(&mut late) => {
+            let (outcome, at_ns) = {
+                let view = late.borrow();
+                (view.outcome.clone(), view.since_ns)
+            };
+            if let Some(outcome) = outcome {
+                let event = Event::Ended { outcome };
+                let federation = name;
+                lines.send(&Happening { at_ns, federation, event }).await;
+            }
+        }
+    }
+    gone(&mut view).await;
+}
+
+/// Waits until nobody drives a federation any more.
+async fn gone(view: &mut watch::Receiver<FederationView>) {
+    while view.changed().await.is_ok() {}
+}
+
+async fn pass_to_end(told: &mut Told, name: &str, lines: &Sender) {
+    while let Some(happening) = next(told, lines).await {
         if happening.federation == name {
             lines.send(&happening).await;
             if matches!(happening.event, Event::Ended { .. }) {

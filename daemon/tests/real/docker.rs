@@ -133,6 +133,12 @@ impl Rig {
             panic!("{outcome:?}");
         };
         assert_eq!(self.containers(), [""; 0]);
+        // A stop that comes while it is undone is answered when that is over.
+        let stopped = async {
+            let mut stream = world.client.stop(&self.name, false).await.unwrap();
+            while stream.next().await.unwrap().is_some() {}
+        };
+        tokio::time::timeout(BOUND, stopped).await.unwrap();
         // Waits for the undoing, unless it is over.
         world.client.remove(&self.name, true).await.ok();
         let run_files = fs::read_dir(&world.paths.run).unwrap();
