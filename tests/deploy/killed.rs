@@ -18,7 +18,7 @@ use rustix::process::{Pid, Signal, kill_process};
 
 use super::Scenario;
 use super::operator::Operator;
-use super::rows::{pair, ticking};
+use super::rows::{kept, pair, ticking};
 
 /// In this order.
 pub(crate) const SCENARIOS: &[Scenario] = &[
@@ -72,9 +72,7 @@ fn an_up_killed_at_each_phase_converges_when_run_again(rig: &Rig) {
         );
         operator.ok(&["down", &file, "--purge"]);
         for host in hosts {
-            let left = host.exec(&["find", "/home/robot/.local/state/ictus", "-type", "f"]);
-            let left: Vec<_> = left.lines().filter(|it| !it.contains("/run/")).collect();
-            assert!(left.is_empty(), "after `{line}` on {}: {left:?}", host.name);
+            assert_eq!(kept(host), "", "after `{line}` on {}", host.name);
             assert_eq!(members(host), "", "after `{line}` on {}", host.name);
             let images = host.docker(&["images", "-q"]);
             assert_eq!(images, "", "after `{line}` on {}", host.name);
