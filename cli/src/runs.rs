@@ -7,12 +7,14 @@ use std::time::Duration;
 use ictus_coord::plan::Plan;
 use ictus_deploy::Checked;
 use ictusd::api::recorded::FileKind;
+use ictusd::api::secret::StartCall;
 use ictusd::api::{Event, Happening, Outcome, StartRequest};
 use ictusd::store::Directory;
 
 use crate::error::{CliError, Kind};
 use crate::hosts::copied::Copied;
 use crate::interrupts::Interrupts;
+use crate::secrets::Secrets;
 use crate::session::{Abroad, Session, request, succeed};
 use crate::ui::Ui;
 
@@ -80,11 +82,14 @@ impl<'a> Runs<'a> {
         }
         // Asked for anew each time: one that has owned nothing for long may have ended.
         let client = self.session.daemon().await?;
-        let request = StartRequest {
-            plan: plan.clone(),
-            ..request(self.checked, trace)
+        let call = StartCall {
+            request: StartRequest {
+                plan: plan.clone(),
+                ..request(self.checked, trace)
+            },
+            secrets: Secrets::read(&self.checked.federates).complete()?,
         };
-        let mut stream = client.start(&name, &request).await?;
+        let mut stream = client.start_with(&name, &call).await?;
         self.names.push(name.clone());
         let outcome = async {
             while let Some(Happening { event, .. }) = stream.next().await? {

@@ -1,9 +1,12 @@
 //! Users and groups of this host, by number or name: from its files, because a static program has no other way.
 
 use std::fs;
+use std::io;
+use std::os::fd::AsFd;
 use std::os::unix::fs::{MetadataExt, PermissionsExt};
 use std::path::{Path, PathBuf};
 
+use rustix::fs::{Gid, Uid};
 use serde::{Deserialize, Serialize};
 
 /// Who a process is to be.
@@ -16,6 +19,14 @@ pub struct Account {
     pub gid: u32,
     /// Further groups.
     pub groups: Vec<u32>,
+}
+
+impl Account {
+    /// Gives it a pipe, so that it may open it again by `/proc/self/fd`.
+    pub(crate) fn own(&self, pipe: impl AsFd) -> io::Result<()> {
+        let (uid, gid) = (Uid::from_raw(self.uid), Gid::from_raw(self.gid));
+        Ok(rustix::fs::fchown(pipe, Some(uid), Some(gid))?)
+    }
 }
 
 /// The account that a manifest's `user` means on this host.

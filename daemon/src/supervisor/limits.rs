@@ -101,6 +101,8 @@ pub(crate) fn schedule(policy: RealtimePolicy, priority: u8) -> io::Result<()> {
 
 /// Groups first: afterwards it may not any more.
 fn become_user(account: &Account) -> io::Result<()> {
+    account.own(io::stdout())?;
+    account.own(io::stderr())?;
     let groups: Vec<Gid> = account.groups.iter().copied().map(Gid::from_raw).collect();
     let (uid, gid) = (Uid::from_raw(account.uid), Gid::from_raw(account.gid));
     rustix::thread::set_thread_groups(&groups)?;

@@ -119,6 +119,9 @@ fn command(spec: &Spec, limits: &str) -> io::Result<(Command, StatusPipe)> {
         return Ok((command, None));
     }
     let (ours, theirs) = pipe_with(PipeFlags::CLOEXEC)?;
+    if let Some(account) = &spec.limits.account {
+        account.own(&theirs)?;
+    }
     // Without it a federate with many peers drops more of its measures.
     fcntl_setpipe_size(&ours, STATUS_PIPE_BYTES).ok();
     // Inherited by the one process that this single-threaded program starts.
