@@ -67,6 +67,43 @@ fn down_without_purge_leaves_the_last_logs_and_names_them() {
 }
 
 #[test]
+#[expect(clippy::print_stderr, reason = "a test's report")]
+fn a_realtime_federate_keeps_its_memory_and_its_secret() {
+    let sandbox = Sandbox::new();
+    let token = sandbox.state().join("token");
+    std::fs::write(&token, "0123456789").unwrap();
+    let text = format!(
+        "ictus: v1\nfederation: kept\nprograms:\n  canary: {{ package: {} }}\nfederates:\n  keeper:\n    \
+         class: Keeper\n    parameters: {{ bytes: 10 }}\n    \
+         realtime: {{ policy: fifo, priority: 5, lock_memory: true }}\n    \
+         secrets: [{{ name: TOKEN, file: token }}]\n",
+        root().join("tests/canary").display()
+    );
+    let manifest = sandbox.manifest("kept.yaml", &text);
+    let output = sandbox.run(&["up", &manifest]);
+    let said = ictus_tests::said(&output);
+    if !output.status.success() {
+        let refused = "this host cannot give federate `keeper`";
+        assert!(said.contains(refused), "{said}");
+        eprintln!("skipped: {said}");
+        return;
+    }
+    let pid = sandbox.pid("kept", "keeper");
+    let status = std::fs::read_to_string(format!("/proc/{pid}/status")).unwrap();
+    let locked = status.lines().find(|line| line.starts_with("VmLck:"));
+    let locked = locked.unwrap().split_ascii_whitespace().nth(1).unwrap();
+    assert!(locked.parse::<u64>().unwrap() > 1000, "{status}");
+    std::fs::write(&token, "9876543210").unwrap();
+    let said = sandbox.fails(&["up", &manifest], 1);
+    let changed = "with another value of secret `TOKEN` of federate `keeper`";
+    assert!(
+        said.contains(changed) && said.contains("ictus down kept"),
+        "{said}"
+    );
+    sandbox.ok(&["down", "kept", "--purge"]);
+}
+
+#[test]
 fn verify_finds_the_diamond_equal() {
     let answer =
         Sandbox::new().json(&[&["verify", DIAMOND, "--set", "run=2 s"][..], &PATIENT].concat());
