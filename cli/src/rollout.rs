@@ -25,6 +25,7 @@ mod execute;
 mod images;
 mod observe;
 pub(crate) mod patience;
+mod reach;
 mod saved;
 
 pub(crate) use again::Again;

@@ -29,6 +29,7 @@ use serde::{Deserialize, Serialize};
 use crate::supervisor::exit::Ending;
 
 pub mod part;
+pub mod reach;
 pub mod recorded;
 pub mod secret;
 

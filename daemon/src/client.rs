@@ -497,6 +497,7 @@ pub fn is_already_running(error: &ClientError) -> bool {
 }
 
 mod parts;
+mod reach;
 mod recorded;
 
 /// A stream of JSON values; dropping it closes the connection.

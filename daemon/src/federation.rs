@@ -156,6 +156,7 @@ impl Federation {
             protocol: PROTOCOL,
             members: BTreeMap::new(),
             rti: None,
+            ports: BTreeMap::new(),
             secrets: None,
             view,
         };

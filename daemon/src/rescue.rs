@@ -95,6 +95,7 @@ pub(crate) fn record(name: &str, directory: &Directory) -> Option<Record> {
         members,
         rti: rti_of(directory),
         secrets: None,
+        ports: BTreeMap::new(),
         view,
     })
 }

@@ -30,6 +30,7 @@ use crate::logs::Follower;
 use crate::store::Leave;
 
 mod parts;
+mod reach;
 mod recorded;
 
 /// Lines of a stream that wait for a slow client.
@@ -62,6 +63,7 @@ pub(crate) fn router(host: Host) -> Router {
         .route("/v1/give-way", post(give_way))
         .route("/metrics", get(metrics))
         .merge(parts::router())
+        .merge(reach::router())
         .merge(recorded::readable())
         .merge(recorded::private())
         .fallback(async || bad_request("no such call; is the daemon of another version?"))

@@ -40,6 +40,9 @@ pub struct Record {
     /// Where the run's secrets are, and their MACs.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub secrets: Option<KeptSecrets>,
+    /// Ports that were chosen for federates of this host, by name.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub ports: BTreeMap<String, u16>,
     /// The federation as it was when the record was written.
     pub view: FederationView,
 }

@@ -18,6 +18,7 @@ mod diff;
 mod observed;
 mod outcome;
 mod plan;
+mod reach;
 mod refusal;
 mod show;
 mod step;
@@ -27,5 +28,6 @@ pub use desired::{Blob, Desired, DesiredError, DesiredHost, Image, ImageFile, Pr
 pub use observed::{Held, MemberState, NewerRecord, Observed, Reached, Run, RunState};
 pub use outcome::{Cause, Ended, Merged, PartOutcome, merge_outcomes};
 pub use plan::{Part, Plan, Stale, plan, plan_down, plan_stop};
+pub use reach::{Needs as ReachNeeds, Protocol, Shut, Way as ReachWay, ways as reach_ways};
 pub use refusal::{Reason, Refusal};
 pub use step::{Operation, Step, StepId};

@@ -1,6 +1,7 @@
 //! The RTI's command line, as a plan asks for it.
 
-use ictus_coord::plan::{ClockSync, OnFailure, Plan, Wire};
+use ictus_coord::plan::{ClockSync, FAILURE_TIMEOUT, OnFailure, Plan, Wire};
+use ictus_core::Duration;
 
 /// The arguments of `ictus`, beginning with `rti`, for a federation's RTI on this port (0: any).
 #[must_use]
@@ -11,6 +12,7 @@ pub fn arguments(plan: &Plan, federation_id: &str, port: u16) -> Vec<String> {
         ClockSync::On => "on",
     };
     let (federates, port) = (plan.federates.len().to_string(), port.to_string());
+    let last;
     let mut args = vec!["rti", "-i", federation_id, "-n", &federates, "-p", &port];
     let (period, trials) = (
         plan.clock.period_ns.to_string(),
@@ -25,6 +27,12 @@ pub fn arguments(plan: &Plan, federation_id: &str, port: u16) -> Vec<String> {
     }
     if plan.wire == Wire::V0_13 {
         args.extend(["--wire", "0.13"]);
+    }
+    if plan.failure_timeout_ns != FAILURE_TIMEOUT.as_nanos() {
+        let failure_timeout = Duration::from_nanos(plan.failure_timeout_ns).to_std();
+        args.push("--failure-timeout");
+        last = failure_timeout.as_millis().to_string();
+        args.push(&last);
     }
     let go_on: Vec<String> = (0_u16..)
         .zip(&plan.federates)

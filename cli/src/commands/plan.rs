@@ -69,10 +69,13 @@ impl PlanCommand {
             rollout.saved(&self.manifest.set).write(out)?;
             ui.stage("saved", &out.display().to_string());
         }
+        let shut = session.block_on(rollout.shut_ways())?;
         let plan = rollout.plan;
-        let answer = serde_json::json!({ "federation": answer, "rollout": plan });
+        let answer = serde_json::json!({ "federation": answer, "rollout": plan, "shut": shut });
         ui.result(&answer, || format!("{}\n\n{plan}", text(&checked)))?;
-        if plan.is_empty() {
+        if !shut.is_empty() {
+            Err(CliError::new(Kind::Unreachable, shut.join("\n")))
+        } else if plan.is_empty() {
             Ok(())
         } else {
             Err(CliError::new(Kind::Changes, "there are changes"))

@@ -4,7 +4,6 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::net::{Ipv4Addr, SocketAddrV4};
 use std::path::{Path, PathBuf};
 
-use ictus_coord::plan::{ClockSync, OnFailure, Wire};
 use ictus_deploy::{Engine, FederateKind, FederateRun};
 
 use crate::agent::{MemberId, RTI};
@@ -150,6 +149,10 @@ impl Run<'_> {
         if let Some(part) = &request.part {
             args.extend(["--bind".to_owned(), part.address.to_string()]);
             args.extend(["--allow".to_owned(), allowed(part)]);
+            if let Some(port) = self.record.view.rti_port.filter(|_| part.ports.is_some()) {
+                // The same number as for TCP: one rule lets both in.
+                args.extend(["--clock-port".to_owned(), port.to_string()]);
+            }
         }
         args
     }
@@ -175,6 +178,9 @@ impl Run<'_> {
                     args.extend(["--data-address".to_owned(), part.address.to_string()]);
                     args.extend(["--allow".to_owned(), allowed(part)]);
                 }
+                if let Some(port) = self.record.ports.get(&run.name) {
+                    args.extend(["--data-port".to_owned(), port.to_string()]);
+                }
                 if self.request.trace {
                     args.extend(["--trace".to_owned(), path(&directory.trace())]);
                 }
@@ -193,47 +199,13 @@ fn allowed(part: &Part) -> String {
 }
 
 fn rti_args(request: &StartRequest, federation_id: &str, prepared: Option<u16>) -> Vec<String> {
-    let plan = &request.plan;
-    let clock = match plan.clock.sync {
-        ClockSync::Off | ClockSync::External => "off",
-        ClockSync::Init => "init",
-        ClockSync::On => "on",
-    };
-    let federates = request.federates.len().to_string();
     let port = prepared.or(request.settings.rti_port).unwrap_or(0);
-    let port = port.to_string();
-    let mut args = vec!["rti", "-i", federation_id, "-n", &federates, "-p", &port];
-    let (period, trials) = (
-        plan.clock.period_ns.to_string(),
-        plan.clock.trials.to_string(),
-    );
-    args.extend(["-c", clock]);
-    if clock != "off" {
-        args.extend(["period", &period, "exchanges-per-interval", &trials]);
-    }
-    if plan.authentication {
-        args.push("-a");
-    }
-    if plan.wire == Wire::V0_13 {
-        args.extend(["--wire", "0.13"]);
-    }
-    let failure_timeout = (plan.failure_timeout_ns / 1_000_000).to_string();
-    args.extend(["--failure-timeout", &failure_timeout]);
-    let go_on: Vec<String> = (0_u16..)
-        .zip(&plan.federates)
-        .filter(|(_, federate)| federate.on_failure == OnFailure::Continue)
-        .map(|(id, _)| id.to_string())
-        .collect();
-    let go_on = go_on.join(",");
-    if !go_on.is_empty() {
-        args.extend(["--continue", &go_on]);
-    }
-    args.into_iter().map(str::to_owned).collect()
+    ictus_deploy::rti::arguments(&request.plan, federation_id, port)
 }
 
 #[cfg(test)]
 mod tests {
-    use ictus_coord::plan::{ClockPlan, FederatePlan, Plan};
+    use ictus_coord::plan::{ClockPlan, ClockSync, FederatePlan, OnFailure, Plan, Wire};
     use ictus_deploy::{Settings, TimingSpec};
     use ictus_rti::{Command, Options};
 

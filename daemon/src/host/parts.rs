@@ -1,7 +1,7 @@
 //! A host's part of a federation over several hosts: leases, blobs, prepare, commit.
 
+use std::collections::BTreeSet;
 use std::io::Read;
-use std::net::{Ipv4Addr, SocketAddrV4, TcpListener};
 
 use ictus_deploy::Engine;
 
@@ -16,6 +16,7 @@ use crate::federation::launch::Run;
 use crate::federation::{Federation, Handle, container};
 use crate::files;
 use crate::leases::{LeaseError, Leases};
+use crate::ports::{self, Assigned};
 use crate::secrets;
 use crate::stamp;
 use crate::store::{self, StoreError};
@@ -128,10 +129,8 @@ impl Host {
             return Err(error(ErrorCode::Failed, what));
         }
         self.check_needs(request)?;
-        let rti_port = part
-            .rti
-            .then(|| free_port(part, request.settings.rti_port))
-            .transpose()?;
+        let ports = ports::assign(part, request, &self.promised_ports(name));
+        let ports = ports.map_err(|error| error_of(error.to_string()))?;
         self.settle(name);
         let id = prepare.id.clone();
         let secrets = self.hand_over(name, request, &prepare.secrets)?;
@@ -142,7 +141,8 @@ impl Host {
         })?;
         record.secrets = secrets;
         self.admit_users(&directory, request)?;
-        record.view.rti_port = rti_port.flatten();
+        record.view.rti_port = ports.rti;
+        record.ports = ports.federates;
         record.view.digest.clone_from(&prepare.digest);
         record.view.facets.clone_from(&prepare.facets);
         record.view.generation = prepare.generation;
@@ -152,6 +152,21 @@ impl Host {
             id: record.view.id,
             rti_port: record.view.rti_port,
         })
+    }
+
+    /// Ports that other federations of this host have, or will have when they are committed.
+    fn promised_ports(&self, name: &str) -> BTreeSet<u16> {
+        let others = self.names().into_iter().filter(|other| other != name);
+        let records = others.filter_map(|other| self.directory(&other).read_record().ok()?);
+        let alive = records.filter(|record| record.view.outcome.is_none());
+        alive
+            .flat_map(|record| {
+                let part = record.view.part.as_ref();
+                let rti = record.view.rti_port;
+                let rti = rti.filter(|_| part.is_none_or(|part| part.rti));
+                record.ports.into_values().chain(rti)
+            })
+            .collect()
     }
 
     /// Makes the images of a prepared part whose engine is Docker.
@@ -239,9 +254,13 @@ impl Host {
             );
             return Err(error(ErrorCode::Failed, what));
         }
-        if let (Some(part), Some(port)) = (&request.part, record.view.rti_port) {
-            // Somebody may have taken it since.
-            bind(part.address, port).map_err(|why| taken(part, port, &why))?;
+        if let Some(part) = &request.part {
+            // Somebody may have taken them since.
+            let assigned = Assigned {
+                rti: record.view.rti_port,
+                federates: record.ports.clone(),
+            };
+            ports::check(part, &assigned).map_err(|error| error_of(error.to_string()))?;
         }
         record.view.metrics = self.listen(name, request.settings.metrics_listen)?;
         self.enter(name, &record, &request)?;
@@ -309,37 +328,6 @@ fn validate_part(part: &Part, federates: usize) -> Result<(), String> {
         return Err(format!("host `{}` is not among the hosts", part.host));
     }
     Ok(())
-}
-
-/// The port for the RTI: the one that is asked for, or a free one of the range; absent when any will do.
-fn free_port(part: &Part, wanted: Option<u16>) -> Result<Option<u16>, ApiError> {
-    if let Some(port) = wanted {
-        bind(part.address, port).map_err(|why| taken(part, port, &why))?;
-        return Ok(Some(port));
-    }
-    let Some(range) = part.ports else {
-        return Ok(None);
-    };
-    let mut ports = range.first..=range.last;
-    let free = ports.find(|port| bind(part.address, *port).is_ok());
-    free.map(Some).ok_or_else(|| {
-        let (host, address) = (&part.host, part.address);
-        let what = format!(
-            "host `{host}`: no port from {} to {} of {address} is free, or {address} is not its address",
-            range.first, range.last
-        );
-        error(ErrorCode::Failed, what)
-    })
-}
-
-fn bind(address: Ipv4Addr, port: u16) -> std::io::Result<()> {
-    TcpListener::bind(SocketAddrV4::new(address, port)).map(drop)
-}
-
-fn taken(part: &Part, port: u16, why: &std::io::Error) -> ApiError {
-    let (host, address) = (&part.host, part.address);
-    let what = format!("host `{host}`: the RTI cannot have port {port} of {address}: {why}");
-    error(ErrorCode::Failed, what)
 }
 
 fn held(lease: &LeaseError) -> ApiError {

@@ -268,7 +268,7 @@ async fn what_cannot_be_prepared_is_said_and_leaves_nothing() {
             .await
             .unwrap_err(),
     );
-    assert!(message.contains("host `one`: no port"), "{message}");
+    assert!(message.contains("0 are free and 1 are needed"), "{message}");
     let taken = with(&|it| it.settings.rti_port = Some(port));
     let (_, message) = refusal(
         world
@@ -302,28 +302,37 @@ async fn what_cannot_be_prepared_is_said_and_leaves_nothing() {
         message.contains("federate `a` needs processors of its own"),
         "{message}"
     );
-    // Taken after it was prepared.
-    let free = TcpListener::bind((HOME, 0))
-        .unwrap()
-        .local_addr()
-        .unwrap()
-        .port();
-    let fine = with(&|it| it.settings.rti_port = Some(free));
-    world.client.prepare((NAME, fence), &fine).await.unwrap();
-    let thief = TcpListener::bind((HOME, free)).unwrap();
-    let (_, message) = refusal(
-        world
-            .client
-            .commit(NAME, &commit(fence, None))
-            .await
-            .unwrap_err(),
-    );
-    assert!(message.contains(&format!("port {free}")), "{message}");
+}
+
+#[tokio::test]
+async fn a_port_taken_between_prepare_and_commit_is_named() {
+    let world = World::new().await;
+    let fence = lease(&world).await;
+    let mut request = part(&federation(&[("a", ""), ("b", "")]), "one", "");
+    request.part.as_mut().unwrap().programs.clear();
+    let free = TcpListener::bind((HOME, 0)).unwrap();
+    let port = free.local_addr().unwrap().port();
+    drop(free);
+    request.settings.rti_port = Some(port);
+    let fine = prepare(request, None);
+    let prepared = world.client.prepare((NAME, fence), &fine).await.unwrap();
+    assert_eq!(prepared.rti_port, Some(port));
+    let thief = TcpListener::bind((HOME, port)).unwrap();
+    let committed = world.client.commit(NAME, &commit(fence, None)).await;
+    let (_, message) = refusal(committed.unwrap_err());
+    let me = std::process::id();
+    for words in [
+        format!("host `one`: port {port} of {HOME}, which the RTI is to have, is taken"),
+        format!("(process {me}, "),
+    ] {
+        assert!(message.contains(&words), "{words} is missing in {message}");
+    }
     drop(thief);
-    assert_eq!(
-        world.client.federation(NAME).await.unwrap().state,
-        State::Prepared
-    );
+    // Nothing of it runs, and who deploys undoes it.
+    let view = world.client.federation(NAME).await.unwrap();
+    assert_eq!(view.state, State::Prepared);
+    world.client.remove_part((NAME, fence), true).await.unwrap();
+    assert!(world.client.federations().await.unwrap().is_empty());
 }
 
 #[tokio::test]

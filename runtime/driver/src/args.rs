@@ -31,6 +31,8 @@ pub(crate) struct RunArgs {
     pub(crate) status_socket: Option<PathBuf>,
     /// Where other federates reach this one, when it is not the address by which it reaches the RTI.
     pub(crate) data_address: Option<Ipv4Addr>,
+    /// The TCP port at which other federates reach this one, and the UDP port of its clock; 0: any.
+    pub(crate) data_port: u16,
     /// From where other federates connect; empty: from everywhere.
     pub(crate) allow: Vec<Ipv4Addr>,
     /// Whether memory is locked before anything runs.
@@ -48,6 +50,8 @@ pub(crate) enum ArgsError {
     BadDescriptor(String),
     #[error("--data-address needs an IPv4 address of this host, not {0:?}")]
     BadAddress(String),
+    #[error("--data-port needs a port (0 to 65535), not {0:?}")]
+    BadPort(String),
     #[error("--allow needs IPv4 addresses with commas between them, not {0:?}")]
     BadPeer(String),
     #[error("nothing to do: give --plan FILE, or --describe")]
@@ -56,7 +60,8 @@ pub(crate) enum ArgsError {
 
 pub(crate) const USAGE: &str = "\
 usage: PROGRAM --plan PLAN.json [--federate NAME]... [--rti HOST:PORT] [-i ID]
-               [--data-address IPv4] [--allow IPv4[,IPv4]...] [--trace DIR] [--timing DIR] [--status-fd N]
+               [--data-address IPv4] [--data-port PORT] [--allow IPv4[,IPv4]...]
+               [--trace DIR] [--timing DIR] [--status-fd N]
                [--lock-memory]
        PROGRAM --plan-env VARIABLE [--status-socket PATH] [...]
        PROGRAM --describe [INSTANCES.json]
@@ -100,6 +105,10 @@ pub(crate) fn parse(args: impl IntoIterator<Item = String>) -> Result<Command, A
                 let text = value()?;
                 let address = text.parse().map_err(|_| ArgsError::BadAddress(text))?;
                 run.data_address = Some(address);
+            }
+            "--data-port" => {
+                let text = value()?;
+                run.data_port = text.parse().map_err(|_| ArgsError::BadPort(text))?;
             }
             "--allow" => {
                 for text in value()?.split(',') {
@@ -146,9 +155,10 @@ mod tests {
             federation_id: Some("x".into()),
             status_fd: Some(3),
             lock_memory: true,
+            data_port: 15_046,
             ..RunArgs::default()
         };
-        let line = "--plan p.json --federate a --federate b --rti 127.0.0.1:15045 -i x --status-fd 3 --lock-memory";
+        let line = "--plan p.json --federate a --federate b --rti 127.0.0.1:15045 -i x --status-fd 3 --lock-memory --data-port 15046";
         assert_eq!(words(line), Ok(Command::Run(Box::new(run))));
         let run = RunArgs {
             plan_env: Some("ICTUS_PLAN".into()),
@@ -164,6 +174,10 @@ mod tests {
         assert_eq!(
             words("--plan p --data-address robot.local"),
             Err(ArgsError::BadAddress("robot.local".into()))
+        );
+        assert_eq!(
+            words("--plan p --data-port 65536"),
+            Err(ArgsError::BadPort("65536".into()))
         );
         assert_eq!(
             words("--plan p --status-fd x"),

@@ -57,7 +57,7 @@ pub enum ClockRefusal {
 }
 
 impl ClockSync {
-    /// Prepares what the plan asks for: for `on` the port of [`ClockSync::udp_port`]. `rti`: its address, when there is one;
+    /// Prepares what the plan asks for: for `on` the port of [`ClockSync::udp_port`], `port` or for 0 any. `rti`: its address, when there is one;
     /// `ours`: it is Ictus's.
     ///
     /// # Errors
@@ -65,7 +65,7 @@ impl ClockSync {
     /// When no UDP socket can be opened.
     pub(crate) fn start(
         plan: &ClockPlan,
-        federate: u16,
+        (federate, port): (u16, u16),
         clock: Arc<SystemClock>,
         rti: Option<SocketAddr>,
         ours: bool,
@@ -91,7 +91,7 @@ impl ClockSync {
             Mode::On => {
                 // What can reach the RTI can be reached by it: on loopback nobody else can.
                 let here = local_address(rti)?;
-                let socket = ProbeSocket::bind(here, 0, stamps())?;
+                let socket = ProbeSocket::bind(here, port, stamps())?;
                 sync.port = socket.port()?;
                 let follower = Follower::new(federate, rti.ip(), ours);
                 sync.waiting = Some((socket, follower));
@@ -253,7 +253,7 @@ mod tests {
         let rti = SocketAddr::new(local, socket.port().unwrap());
         let clock = skewed();
         let mut sync =
-            ClockSync::start(&plan(Mode::On), 3, clock.clone(), Some(rti), true).unwrap();
+            ClockSync::start(&plan(Mode::On), (3, 0), clock.clone(), Some(rti), true).unwrap();
         sync.begin(joining(&reference, &clock)).unwrap();
         let federate = SocketAddr::new(local, sync.udp_port());
         let mut stranger = ProbeSocket::bind(local, 0, Stamps::Reader).unwrap();
@@ -287,7 +287,8 @@ mod tests {
         let reference = HostClock::steady();
         let clock = skewed();
         let rti = Some(([127, 0, 0, 1], 1).into());
-        let mut sync = ClockSync::start(&plan(Mode::Init), 0, clock.clone(), rti, true).unwrap();
+        let mut sync =
+            ClockSync::start(&plan(Mode::Init), (0, 0), clock.clone(), rti, true).unwrap();
         assert_eq!(sync.udp_port(), 0);
         assert_eq!(sync.status().bound_ns, None);
         sync.begin(joining(&reference, &clock)).unwrap();
@@ -307,7 +308,7 @@ mod tests {
             ..plan(sync)
         };
         let start =
-            |plan: &ClockPlan| ClockSync::start(plan, 0, clock.clone(), None, true).unwrap();
+            |plan: &ClockPlan| ClockSync::start(plan, (0, 0), clock.clone(), None, true).unwrap();
         let most = Duration::from_nanos(1);
         let mut off = start(&strict(Mode::Off, 1, OnExceed::Warn));
         assert_eq!(off.check(), Err(ClockRefusal::Unknown { most }));

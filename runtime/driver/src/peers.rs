@@ -68,10 +68,14 @@ impl Peers {
         }
     }
 
-    /// Listens at `address`, when others will connect, and tells the federate where.
-    pub(crate) fn listen(&mut self, address: IpAddr, federate: &mut Federate) -> io::Result<()> {
+    /// Listens at `address`, when others will connect, and tells the federate where; port 0: any.
+    pub(crate) fn listen(
+        &mut self,
+        address: SocketAddr,
+        federate: &mut Federate,
+    ) -> io::Result<()> {
         if federate.expects_peers() {
-            let listener = TcpListener::bind((address, 0))?;
+            let listener = TcpListener::bind(address)?;
             listener.set_nonblocking(true)?;
             federate.listening(listener.local_addr()?.port());
             self.listener = Some(listener);
@@ -343,8 +347,8 @@ mod tests {
         false
     }
 
-    fn here() -> IpAddr {
-        IpAddr::V4(Ipv4Addr::LOCALHOST)
+    fn here() -> SocketAddr {
+        SocketAddr::from((Ipv4Addr::LOCALHOST, 0))
     }
 
     fn look(peers: &mut Peers, federate: &mut Federate) {
@@ -410,7 +414,7 @@ mod tests {
     #[test]
     fn a_receiver_that_takes_nothing_is_given_up_and_one_that_is_slow_is_not() {
         let (mut peers, mut federate) = (Peers::default(), federate(false));
-        let listener = TcpListener::bind((here(), 0)).unwrap();
+        let listener = TcpListener::bind(here()).unwrap();
         let port = listener.local_addr().unwrap().port();
         hear(
             &mut federate,

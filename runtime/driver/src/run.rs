@@ -238,7 +238,7 @@ struct Job<'a> {
 
 fn run_one(job: &Job<'_>, ids: &[u16], rti: Option<SocketAddr>) -> Result<u8, RunError> {
     let clock = Arc::new(clock_of(job.plan, ids, rti));
-    let sync = keep_clock(job.plan, ids, rti, &clock)?;
+    let sync = keep_clock(job, ids, rti, &clock)?;
     let mut assembly = Assembly::new(job.plan, ids, job.classes, clock.clone())?;
     let observation = Observation {
         trace: job.args.trace.clone(),
@@ -297,6 +297,7 @@ fn run_one(job: &Job<'_>, ids: &[u16], rti: Option<SocketAddr>) -> Result<u8, Ru
         start: Tag::NEVER,
         outside: Vec::new(),
         data_address: job.args.data_address,
+        data_port: job.args.data_port,
         signals: 0,
         written_at: PhysicalTime::NEVER,
         reported_at: PhysicalTime::NEVER,
@@ -322,15 +323,16 @@ fn clock_of(plan: &Plan, ids: &[u16], rti: Option<SocketAddr>) -> SystemClock {
 }
 
 fn keep_clock(
-    plan: &Plan,
+    job: &Job<'_>,
     ids: &[u16],
     rti: Option<SocketAddr>,
     clock: &Arc<SystemClock>,
 ) -> Result<ClockSync, RunError> {
+    let (plan, port) = (job.plan, job.args.data_port);
     let id = ids.first().copied().unwrap_or_default();
     let clock = Arc::clone(clock);
-    let mut sync =
-        ClockSync::start(&plan.clock, id, clock, rti, plan.extensions).map_err(RunError::Io)?;
+    let mut sync = ClockSync::start(&plan.clock, (id, port), clock, rti, plan.extensions)
+        .map_err(RunError::Io)?;
     let compared = matches!(
         plan.clock.sync,
         ictus_coord::plan::ClockSync::Init | ictus_coord::plan::ClockSync::On
@@ -401,6 +403,7 @@ struct Runner<'a> {
     start: Tag,
     outside: Vec<OutsideEvent>,
     data_address: Option<Ipv4Addr>,
+    data_port: u16,
     signals: usize,
     written_at: PhysicalTime,
     reported_at: PhysicalTime,
@@ -460,10 +463,11 @@ impl Runner<'_> {
                 Some(address) => IpAddr::V4(address),
                 None => connection.local().map_err(RunError::Io)?.ip(),
             };
+            let address = SocketAddr::new(here, self.data_port);
             let peers = &mut self.io.peers;
             peers
-                .listen(here, &mut self.federate)
-                .map_err(RunError::Io)?;
+                .listen(address, &mut self.federate)
+                .map_err(|source| RunError::Listen { address, source })?;
         }
         Ok(())
     }

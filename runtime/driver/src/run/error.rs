@@ -61,6 +61,14 @@ pub enum RunError {
         /// Why.
         source: io::Error,
     },
+    /// The address for other federates cannot be listened on.
+    #[error("cannot listen for other federates at {address}: {source}")]
+    Listen {
+        /// Where.
+        address: SocketAddr,
+        /// Why.
+        source: io::Error,
+    },
     /// The plan and the program do not fit.
     #[error(transparent)]
     Assembly(#[from] AssemblyError),
@@ -99,6 +107,7 @@ impl RunError {
             | Self::Observe(_)
             | Self::Status(_)
             | Self::LockMemory(_)
+            | Self::Listen { .. }
             | Self::Io(_)
             | Self::Interrupted => exit::FAILED,
         }

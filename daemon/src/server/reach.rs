@@ -1,0 +1,37 @@
+//! The routes that try whether hosts can connect; see [`crate::api::reach`].
+
+use axum::Router;
+use axum::response::Json;
+use axum::routing::post;
+
+use crate::api::reach::{ListenRequest, Listening, ProbeRequest, Reached};
+use crate::api::{ApiError, ErrorCode};
+use crate::host::Host;
+use crate::reach::{self, ReachError};
+
+/// The routes.
+pub(super) fn router() -> Router<Host> {
+    Router::new()
+        .route("/v1/reach/listen", post(listen))
+        .route("/v1/reach/probe", post(probe))
+}
+
+async fn listen(Json(request): Json<ListenRequest>) -> Result<Json<Listening>, ApiError> {
+    reach::listen(request).await.map(Json).map_err(refused)
+}
+
+async fn probe(Json(request): Json<ProbeRequest>) -> Result<Json<Reached>, ApiError> {
+    reach::probe(&request).await.map(Json).map_err(refused)
+}
+
+fn refused(error: ReachError) -> ApiError {
+    let code = match error {
+        ReachError::Word => ErrorCode::BadRequest,
+        ReachError::Listen { .. } => ErrorCode::Failed,
+    };
+    ApiError {
+        code,
+        message: error.to_string(),
+        known: Vec::new(),
+    }
+}
