@@ -8,8 +8,8 @@
 //! Law `a_cut_shorter_than_the_timeout_is_no_loss`: as the kernel sends again less and less often (up to twice as late each time),
 //! a host is not given up when the timeout is over, but when something that was sent after it has found no answer either.
 //!
-//! Law `a_host_that_is_gone_is_found`: that takes at most two and a half times the timeout, and a second, while anything is to be
-//! answered or the kernel asks by itself four times per timeout.
+//! Law `a_host_that_is_gone_is_found`: that takes at most three and a quarter timeouts and a second, while anything is to be
+//! answered or the kernel asks by itself four times per timeout; less than two where data is sent again at an even pace.
 
 use std::collections::BTreeMap;
 use std::net::IpAddr;

@@ -269,7 +269,7 @@ fn run_one(job: &Job<'_>, ids: &[u16], rti: Option<SocketAddr>) -> Result<u8, Ru
             link.data_address = job.args.data_address.map(|address| address.octets());
             if job.args.data_address.is_some() {
                 // There are other hosts, and the RTI may see one vanish later than this federate does.
-                link.found_later = failure_timeout + failure_timeout;
+                link.found_later = failure_timeout + failure_timeout + failure_timeout;
             }
             Federate::federated(program, config, link)
         }
