@@ -14,6 +14,7 @@ const ARROWS: &[(&str, &[&str])] = &[
     ("ictus-macros", &[]),
     ("ictus-coord", &["ictus-core"]),
     ("ictus-clock", &["ictus-core", "ictus-coord"]),
+    ("ictus-stream", &[]),
     ("ictus-sim", &["ictus-core", "ictus-coord"]),
     ("ictus-metrics", &["ictus-core"]),
     (
@@ -25,11 +26,18 @@ const ARROWS: &[(&str, &[&str])] = &[
             "ictus-macros",
             "ictus-metrics",
             "ictus-sim",
+            "ictus-stream",
         ],
     ),
     (
         "ictus-rti",
-        &["ictus-core", "ictus-coord", "ictus-clock", "ictus-metrics"],
+        &[
+            "ictus-core",
+            "ictus-coord",
+            "ictus-clock",
+            "ictus-metrics",
+            "ictus-stream",
+        ],
     ),
     ("ictus-deploy", &["ictus-core", "ictus-coord"]),
     (
@@ -41,6 +49,7 @@ const ARROWS: &[(&str, &[&str])] = &[
             "ictus-deploy",
             "ictus-metrics",
             "ictus-rti",
+            "ictus-stream",
         ],
     ),
     (
@@ -51,6 +60,7 @@ const ARROWS: &[(&str, &[&str])] = &[
             "ictus-deploy",
             "ictus-metrics",
             "ictus-rti",
+            "ictus-stream",
             "ictusd",
         ],
     ),

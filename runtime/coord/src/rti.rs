@@ -181,6 +181,12 @@ pub enum Disconnect {
     /// The peer reset the connection.
     #[error("the connection was reset")]
     Reset,
+    /// It ended, and the peer had not said that it would; only where connections are protected.
+    #[error("the connection was cut")]
+    Cut,
+    /// The peer is not who it should be, or its bytes are not its own; in words.
+    #[error("{0}")]
+    Unfit(String),
     /// The driver closed it to make room: [`Rti::least_needed`].
     #[error("its place was given to another")]
     Evicted,
@@ -303,6 +309,8 @@ struct Connection {
     peer: String,
     local: Option<IpAddr>,
     nonce: Option<Nonce>,
+    /// The federate whose certificate it has shown, where there are any.
+    certified: Option<u16>,
     output: Output,
     /// Whether it stands in [`Rti::outputs`].
     queued: bool,
@@ -434,6 +442,7 @@ impl Rti {
             peer,
             local,
             nonce,
+            certified: None,
             output: Output::new(),
             queued: false,
         };
@@ -452,6 +461,11 @@ impl Rti {
             );
         }
         id
+    }
+
+    /// The peer has shown the certificate of this federate: it is taken for no other.
+    pub fn certify(&mut self, id: ConnectionId, federate: u16) {
+        self.connections[id.0].certified = Some(federate);
     }
 
     /// Takes the complete messages at the start of `bytes` and returns how many bytes they are; the driver keeps the rest
@@ -495,7 +509,14 @@ impl Rti {
             Link::Free => return,
             Link::Unknown { .. } => {
                 let peer = self.connections[id.0].peer.clone();
-                let reason = format!("{why} before it said who it is");
+                let reason = match why {
+                    Disconnect::Unfit(words) => words.clone(),
+                    Disconnect::Eof
+                    | Disconnect::Reset
+                    | Disconnect::Cut
+                    | Disconnect::Evicted
+                    | Disconnect::Error(_) => format!("{why} before it said who it is"),
+                };
                 self.events.push_back(RtiEvent::Rejected { peer, reason });
             }
             Link::Member(federate) => {

@@ -215,6 +215,33 @@ fn strangers_are_refused_with_the_reason_that_lf_gives() {
 }
 
 #[test]
+fn a_federate_is_whom_its_certificate_names() {
+    let mut world = World::new(&plan("stop-federation", ""));
+    let stream = world.federate.peer_accepted();
+    world.federate.peer_certified(stream, 2);
+    world.says(stream, &hello(1, b"test"));
+    let refused = FromPeer::Reject(RejectReason::HmacWrong);
+    assert_eq!(world.answer(stream), Some(refused));
+    world.federate.peer_unfit("no certificate".to_owned());
+    assert_eq!(world.federate.counters().refused, 2);
+    let stream = world.federate.peer_accepted();
+    world.federate.peer_certified(stream, 1);
+    world.says(stream, &hello(1, b"test"));
+    assert_eq!(world.answer(stream), Some(FromPeer::Ack));
+    let mut words = Vec::new();
+    while let Some(event) = world.federate.poll_event() {
+        if let FederateEvent::PeerRefused(what) = event {
+            words.push(what);
+        }
+    }
+    let expected = [
+        "federate 2, by its certificate, says that it is federate 1",
+        "no certificate",
+    ];
+    assert_eq!(words, expected);
+}
+
+#[test]
 fn messages_wait_until_the_start_tag_is_known() {
     let mut world = World::new(&plan("stop-federation", ""));
     let sender = world.meets(1);

@@ -126,6 +126,10 @@ impl World {
             ["connect", name, "from", peer, "to", local] => {
                 self.connect(name, peer, Some(local.parse().unwrap()));
             }
+            ["certificate", name, "of", federate] => {
+                let federate = federate.parse().unwrap();
+                self.rti.certify(self.connections[name], federate);
+            }
             ["stop"] => self.rti.request_stop(self.now),
             ["wait", ms] => {
                 self.now = self.now + Duration::from_millis(ms.parse().unwrap());

@@ -37,6 +37,8 @@ pub(crate) struct RunArgs {
     pub(crate) allow: Vec<Ipv4Addr>,
     /// Whether memory is locked before anything runs.
     pub(crate) lock_memory: bool,
+    /// Where certificate and key are; absent: connections are in the clear.
+    pub(crate) tls: Option<PathBuf>,
 }
 
 /// Why a command line is refused.
@@ -61,7 +63,7 @@ pub(crate) enum ArgsError {
 pub(crate) const USAGE: &str = "\
 usage: PROGRAM --plan PLAN.json [--federate NAME]... [--rti HOST:PORT] [-i ID]
                [--data-address IPv4] [--data-port PORT] [--allow IPv4[,IPv4]...]
-               [--trace DIR] [--timing DIR] [--status-fd N]
+               [--tls DIR] [--trace DIR] [--timing DIR] [--status-fd N]
                [--lock-memory]
        PROGRAM --plan-env VARIABLE [--status-socket PATH] [...]
        PROGRAM --describe [INSTANCES.json]
@@ -96,6 +98,7 @@ pub(crate) fn parse(args: impl IntoIterator<Item = String>) -> Result<Command, A
             "-i" | "--id" => run.federation_id = Some(value()?),
             "--trace" => run.trace = Some(value()?.into()),
             "--timing" => run.timing = Some(value()?.into()),
+            "--tls" => run.tls = Some(value()?.into()),
             "--status-fd" => {
                 let text = value()?;
                 run.status_fd = Some(text.parse().map_err(|_| ArgsError::BadDescriptor(text))?);
@@ -156,9 +159,11 @@ mod tests {
             status_fd: Some(3),
             lock_memory: true,
             data_port: 15_046,
+            tls: Some("tls/a".into()),
             ..RunArgs::default()
         };
-        let line = "--plan p.json --federate a --federate b --rti 127.0.0.1:15045 -i x --status-fd 3 --lock-memory --data-port 15046";
+        let line = "--plan p.json --federate a --federate b --rti 127.0.0.1:15045 -i x --status-fd 3 --lock-memory \
+                    --data-port 15046 --tls tls/a";
         assert_eq!(words(line), Ok(Command::Run(Box::new(run))));
         let run = RunArgs {
             plan_env: Some("ICTUS_PLAN".into()),

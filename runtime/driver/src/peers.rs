@@ -5,6 +5,7 @@ use ictus_coord::FederateExecutor;
 use ictus_coord::federate::{Federate, PeerStream};
 use ictus_coord::silence::Silent;
 use ictus_core::{Duration, PhysicalTime, Tag};
+use ictus_stream::{Credentials, Member};
 use std::collections::BTreeSet;
 use std::io;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr, TcpListener};
@@ -30,6 +31,8 @@ pub(crate) struct Peers {
     allow: Vec<Ipv4Addr>,
     /// How long another host may be silent.
     failure_timeout: Duration,
+    /// What is shown to others; absent: connections are in the clear.
+    credentials: Option<Credentials>,
 }
 
 #[derive(Debug)]
@@ -37,6 +40,8 @@ struct Peer {
     stream: PeerStream,
     connection: Connection,
     accepted: bool,
+    /// The receiver that was to be reached.
+    receiver: Option<u16>,
     /// Whether the federate was told that the other end has closed.
     told: bool,
     /// Whether nothing more will be written.
@@ -46,11 +51,12 @@ struct Peer {
 }
 
 impl Peer {
-    const fn new(stream: PeerStream, connection: Connection, accepted: bool) -> Self {
+    const fn new(stream: PeerStream, connection: Connection, receiver: Option<u16>) -> Self {
         Self {
             stream,
             connection,
-            accepted,
+            accepted: receiver.is_none(),
+            receiver,
             told: false,
             finished: false,
             stuck_since: None,
@@ -59,11 +65,17 @@ impl Peer {
 }
 
 impl Peers {
-    /// None yet, and strangers from other addresses never; empty: from everywhere. Other hosts may be silent for so long.
-    pub(crate) fn allowing(allow: Vec<Ipv4Addr>, failure_timeout: Duration) -> Self {
+    /// None yet, and strangers from other addresses (none are named: from everywhere), or without a certificate where
+    /// there are `credentials`, never. Other hosts may be silent for so long.
+    pub(crate) fn allowing(
+        allow: Vec<Ipv4Addr>,
+        credentials: Option<Credentials>,
+        failure_timeout: Duration,
+    ) -> Self {
         Self {
             allow,
             failure_timeout,
+            credentials,
             ..Self::default()
         }
     }
@@ -98,11 +110,14 @@ impl Peers {
         address: ([u8; 4], u16),
     ) -> Option<String> {
         let address = SocketAddr::from((Ipv4Addr::from(address.0), address.1));
-        let opened = Connection::open(address, CONNECT_MAX);
+        let to = self.credentials.as_ref();
+        let to = to.map(|credentials| (credentials, Member::Federate(receiver)));
+        let opened = Connection::open(address, CONNECT_MAX, to);
         match opened.and_then(|it| it.watch(self.failure_timeout).map(|()| it)) {
             Ok(connection) => {
                 let stream = federate.peer_connected(receiver);
-                self.connections.push(Peer::new(stream, connection, false));
+                let peer = Peer::new(stream, connection, Some(receiver));
+                self.connections.push(peer);
                 None
             }
             Err(error) => {
@@ -133,13 +148,29 @@ impl Peers {
             if !connection.closed() && !full {
                 drained &= connection.read();
             }
+            if federate.peer_is_stranger(peer.stream)
+                && let Some(id) = connection.certified()
+            {
+                federate.peer_certified(peer.stream, id);
+            }
             let used = federate.receive_from_peer(now, peer.stream, connection.bytes(), executor);
             connection.take(used);
             // What came before the start tag is known waits in the buffer.
             let offered = connection.bytes().is_empty() || started;
             if connection.closed() && offered && !peer.told {
                 peer.told = true;
-                let cut = !connection.bytes().is_empty() || connection.lost().is_some();
+                let lost = connection.cut() || connection.lost().is_some();
+                let cut = !connection.bytes().is_empty() || lost;
+                if let Some(why) = connection.failure() {
+                    let words = match peer.receiver {
+                        None => format!(
+                            "somebody who has connected from {}: {why}",
+                            connection.peer()
+                        ),
+                        Some(id) => format!("federate {id} at {}: {why}", connection.peer()),
+                    };
+                    federate.peer_unfit(words);
+                }
                 federate.peer_closed(now, peer.stream, cut);
             }
         }
@@ -156,13 +187,14 @@ impl Peers {
                 // Not a host of the federation: it is told nothing.
                 continue;
             }
-            let connection = Connection::of(stream, address);
+            let credentials = self.credentials.as_ref();
+            let connection = Connection::accepted(stream, address, credentials);
             let watched = connection.and_then(|it| it.watch(self.failure_timeout).map(|()| it));
             let Ok(connection) = watched else {
                 continue;
             };
             let stream = federate.peer_accepted();
-            self.connections.push(Peer::new(stream, connection, true));
+            self.connections.push(Peer::new(stream, connection, None));
         }
         let silent = |peer: &Peer| peer.accepted && federate.peer_is_stranger(peer.stream);
         let mut strangers = self.connections.iter().filter(|peer| silent(peer)).count();
@@ -198,7 +230,7 @@ impl Peers {
         for peer in &mut self.connections {
             let out = federate.peer_output(peer.stream);
             let before = out.len();
-            if before > 0 {
+            if before > 0 || peer.connection.owed() > 0 {
                 peer.connection.write(out);
             }
             let empty = out.is_empty();
@@ -208,8 +240,7 @@ impl Peers {
                 peer.stuck_since.get_or_insert(now);
             }
             if empty && !peer.finished && federate.peer_over(peer.stream) {
-                peer.connection.finish();
-                peer.finished = true;
+                peer.finished = peer.connection.finish();
             }
         }
     }
@@ -245,7 +276,7 @@ impl Peers {
         let lengths = self
             .connections
             .iter()
-            .map(|p| federate.peer_output(p.stream).len());
+            .map(|p| federate.peer_output(p.stream).len() + p.connection.owed());
         lengths.max().unwrap_or(0)
     }
 
@@ -271,11 +302,12 @@ mod tests {
     use ictus_coord::PayloadError;
     use ictus_coord::federate::{FederateConfig, FederateEvent, LinkConfig, Outcome};
     use ictus_coord::plan::{Plan, Wire};
-    use ictus_coord::wire::{FromPeer, ToFederate, ToPeer, ToRti};
+    use ictus_coord::wire::{FromPeer, RejectReason, ToFederate, ToPeer, ToRti};
     use ictus_core::{
         ActionId, Effects, Executor, InputId, NodeId, OutputId, PortKind, ProgramBuilder, SlotId,
         ValueId,
     };
+    use ictus_stream::Authority;
     use std::io::{Read, Write};
     use std::net::TcpStream;
     use std::sync::Arc;
@@ -361,7 +393,8 @@ mod tests {
     fn only_hosts_of_the_federation_connect() {
         for (allowed, taken) in [([10, 9, 8, 7], 0), ([127, 0, 0, 1], 1)] {
             let mut federate = federate(true);
-            let mut peers = Peers::allowing(vec![Ipv4Addr::from(allowed)], Duration::from_secs(10));
+            let allowed = vec![Ipv4Addr::from(allowed)];
+            let mut peers = Peers::allowing(allowed, None, Duration::from_secs(10));
             peers.listen(here(), &mut federate).unwrap();
             let address = peers.listener.as_ref().unwrap().local_addr().unwrap();
             let stranger = TcpStream::connect(address).unwrap();
@@ -411,6 +444,63 @@ mod tests {
         assert_eq!(peers.connections.len(), 1);
     }
 
+    /// The sender is let in by its certificate; nobody is by that of another, or without.
+    #[test]
+    fn federates_meet_by_their_certificates() {
+        let authority = Authority::new("run").unwrap();
+        let credentials = |id| {
+            let papers = authority.certify(Member::Federate(id)).unwrap();
+            Credentials::of(&papers).unwrap()
+        };
+        let mut federate = federate(true);
+        let mut peers = Peers::allowing(Vec::new(), Some(credentials(0)));
+        peers.listen(here(), &mut federate).unwrap();
+        let address = peers.listener.as_ref().unwrap().local_addr().unwrap();
+        let mut bytes = Vec::new();
+        let hello = ToPeer::Hello {
+            federate: 1,
+            federation: b"test",
+            transient: false,
+        };
+        hello.encode(Wire::V0_12, &mut bytes);
+        let mut plain = TcpStream::connect(address).unwrap();
+        plain.write_all(&bytes).unwrap();
+        while federate.counters().refused < 1 {
+            look(&mut peers, &mut federate);
+        }
+        let patience = Duration::from_secs(5);
+        let mut meet = |id: u16, peers: &mut Peers| {
+            let own = credentials(id);
+            let to = Some((&own, Member::Federate(0)));
+            let mut connection = Connection::open(address, patience, to).unwrap();
+            let mut out = bytes.clone();
+            while connection.bytes().is_empty() {
+                connection.read();
+                connection.write(&mut out);
+                look(peers, &mut federate);
+            }
+            let (answer, _) = FromPeer::decode(connection.bytes()).unwrap().unwrap();
+            (connection, answer)
+        };
+        let (_other, answer) = meet(2, &mut peers);
+        assert_eq!(answer, FromPeer::Reject(RejectReason::HmacWrong));
+        let (_sender, answer) = meet(1, &mut peers);
+        assert_eq!(answer, FromPeer::Ack);
+        assert_eq!(federate.counters().refused, 2);
+        let words: Vec<_> = std::iter::from_fn(|| federate.poll_event())
+            .filter_map(|event| match event {
+                FederateEvent::PeerRefused(words) => Some(words),
+                _ => None,
+            })
+            .collect();
+        assert!(words[0].contains("it does not speak TLS"), "{words:?}");
+        assert!(
+            words[1].contains("federate 2, by its certificate"),
+            "{words:?}"
+        );
+        assert!(!federate.peers_missing());
+    }
+
     #[test]
     fn a_receiver_that_takes_nothing_is_given_up_and_one_that_is_slow_is_not() {
         let (mut peers, mut federate) = (Peers::default(), federate(false));
@@ -449,7 +539,12 @@ mod tests {
             receiver.read_exact(&mut taken[..64 << 10]).unwrap();
             peers.write(later(9), &mut federate);
         }
-        peers.write(later(9), &mut federate);
+        // The kernel may still have been making room.
+        let mut before = usize::MAX;
+        while peers.backlog(&mut federate) < before {
+            before = peers.backlog(&mut federate);
+            peers.write(later(9), &mut federate);
+        }
         peers.give_up(later(15), &mut federate);
         assert!(federate.outcome().is_none());
         peers.give_up(later(20), &mut federate);

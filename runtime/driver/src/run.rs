@@ -23,6 +23,7 @@ use ictus_coord::measure::LagNews;
 use ictus_coord::plan::Plan;
 use ictus_coord::report::{FederateStatus, exit};
 use ictus_core::{Duration, PhysicalTime, Tag};
+use ictus_stream::{Credentials, Member};
 use nix::libc;
 use std::io::{self, Write};
 use std::net::{IpAddr, Ipv4Addr, SocketAddr, ToSocketAddrs};
@@ -275,14 +276,17 @@ fn run_one(job: &Job<'_>, ids: &[u16], rti: Option<SocketAddr>) -> Result<u8, Ru
         }
         (Some(_) | None, _) => Federate::alone(program, config),
     };
-    let connection = rti.map(connect).transpose()?;
+    let credentials = credentials(job, ids)?;
+    let connection = rti.map(|rti| connect(rti, credentials.as_ref()));
+    let connection = connection.transpose()?;
     if let Some(connection) = &connection {
         connection.watch(failure_timeout).map_err(RunError::Io)?;
     }
+    let allow = job.args.allow.clone();
     let runner = Runner {
         io: Io {
             connection,
-            peers: Peers::allowing(job.args.allow.clone(), failure_timeout),
+            peers: Peers::allowing(allow, credentials, failure_timeout),
             waker: Waker::new().map_err(RunError::Io)?,
             signals: Signals::new().map_err(RunError::Io)?,
             lookout: Lookout::new(failure_timeout),
@@ -366,11 +370,25 @@ fn nonce() -> Result<Nonce, RunError> {
     Ok(nonce)
 }
 
-fn connect(address: SocketAddr) -> Result<Connection, RunError> {
+/// What a federate shows, if it is to show anything.
+fn credentials(job: &Job<'_>, ids: &[u16]) -> Result<Option<Credentials>, RunError> {
+    let (Some(directory), [id]) = (&job.args.tls, ids) else {
+        return Ok(None);
+    };
+    let credentials = Credentials::load(directory, Member::Federate(*id));
+    let credentials = credentials.map_err(|source| RunError::Credentials {
+        directory: directory.clone(),
+        source,
+    })?;
+    Ok(Some(credentials))
+}
+
+fn connect(address: SocketAddr, credentials: Option<&Credentials>) -> Result<Connection, RunError> {
+    let to = credentials.map(|credentials| (credentials, Member::Rti));
     let clock = SystemClock::new();
     let until = clock.now() + CONNECT_FOR;
     loop {
-        match Connection::open(address, Duration::from_secs(5)) {
+        match Connection::open(address, Duration::from_secs(5), to) {
             Ok(connection) => return Ok(connection),
             Err(source) if clock.now() > until => {
                 return Err(RunError::Connect { address, source });
@@ -625,7 +643,7 @@ impl Runner<'_> {
     fn write(&mut self, now: PhysicalTime) {
         self.written_at = now;
         if let (Some(connection), Some(out)) = (&mut self.io.connection, self.federate.output())
-            && !out.is_empty()
+            && (!out.is_empty() || connection.owed() > 0)
         {
             connection.write(out);
         }
@@ -768,8 +786,7 @@ impl Runner<'_> {
             };
             // Last: who reads what was sent to it may still need the RTI to count this federate as here.
             if empty && waiting == 0 && !finished {
-                connection.finish();
-                finished = true;
+                finished = connection.finish();
             }
             connection.read();
             let count = connection.bytes().len();
@@ -814,10 +831,7 @@ impl Runner<'_> {
                     format!("stopped because federate {name} was lost"),
                 )
             }
-            Some(outcome @ Outcome::RtiLost) => {
-                let rti = self.rti_name();
-                (exit::RTI_LOST, format!("{outcome}{rti}"))
-            }
+            Some(outcome @ Outcome::RtiLost) => self.rti_lost(outcome),
             Some(outcome @ Outcome::RtiFailed) => (exit::PEER_FAILED, outcome.to_string()),
             Some(
                 outcome @ (Outcome::Rejected(_)
@@ -830,6 +844,18 @@ impl Runner<'_> {
             }
             Some(outcome @ Outcome::Clock(_)) => (exit::CLOCK, outcome.to_string()),
             Some(outcome) => (exit::FAILED, outcome.to_string()),
+        }
+    }
+
+    fn rti_lost(&self, outcome: &Outcome) -> (u8, String) {
+        let rti = self.rti_name();
+        let failure = self.io.connection.as_ref().and_then(Connection::failure);
+        match failure {
+            Some(why) if self.start == Tag::NEVER => {
+                (exit::NOT_JOINED, format!("cannot join the RTI{rti}: {why}"))
+            }
+            Some(why) => (exit::RTI_LOST, format!("{outcome}{rti}: {why}")),
+            None => (exit::RTI_LOST, format!("{outcome}{rti}")),
         }
     }
 }

@@ -2,6 +2,7 @@
 
 use std::ffi::OsString;
 use std::net::{IpAddr, Ipv4Addr};
+use std::path::PathBuf;
 
 use ictus_clock::Stamps;
 use ictus_coord::plan::{FAILURE_TIMEOUT, Wire};
@@ -53,6 +54,8 @@ Coordinates one federation; takes the options of Lingua Franca's RTI.
       --max-output SIZE         the most that may wait for one federate (default 256M); more ends the
                                 federation
       --wire 0.12|0.13          the layout of address queries: LF's to 0.12 (default), or from 0.13 on
+      --tls DIRECTORY           take federates only with certificates of this run, as `ictus up` makes them:
+                                authority.pem, certificate.pem and key.pem there
       --status-fd FD            write one JSON object a line to this inherited descriptor
   -v, --version
   -h, --help";
@@ -75,6 +78,8 @@ pub struct Options {
     pub bind: IpAddr,
     /// From where connections are taken; empty: from everywhere.
     pub allow: Vec<Ipv4Addr>,
+    /// Where certificate and key are; absent: connections are in the clear.
+    pub tls: Option<PathBuf>,
     /// Whether nobody chose that address.
     pub bind_is_default: bool,
     /// How long another host may answer nothing at all.
@@ -134,6 +139,7 @@ impl Options {
             config: RtiConfig::new(federation, federates),
             bind: IpAddr::V4(Ipv4Addr::LOCALHOST),
             allow: Vec::new(),
+            tls: None,
             bind_is_default: true,
             failure_timeout: FAILURE_TIMEOUT,
             port: 0,
@@ -212,6 +218,7 @@ impl Parser {
                 self.options.clock_port = self.number(option, "a port (0 to 65535)")?;
             }
             "--clock-stamps" => self.options.stamps = self.stamps(option)?,
+            "--tls" => self.options.tls = Some(self.value(option)?.into()),
             "-d" | "--dnet_disabled" => self.options.config.dnet = false,
             "-m" | "--start-time-multiple" => {
                 self.options.config.start_multiple = Some(self.multiple(option)?);
@@ -244,7 +251,7 @@ impl Parser {
                 return Ok(Some(format!("ictus rti {}", env!("CARGO_PKG_VERSION"))));
             }
             "-h" | "--help" => return Ok(Some(HELP.to_owned())),
-            "-tls" => return unsupported(option, "there is no TLS"),
+            "-tls" => return unsupported(option, "it has no TLS of LF's; see `--tls`"),
             "-sst" => return unsupported(option, "there is no SST"),
             "-nt" => return unsupported(option, "there are no transient federates"),
             _ => return Err(UsageError::Unknown(option.to_owned())),
@@ -422,6 +429,13 @@ fn invalid<T>(option: &str, expected: &'static str, value: String) -> Result<T, 
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn certificates_are_in_a_directory() {
+        let options = parse("-n 1 --tls /run/ictus/rti").unwrap();
+        assert_eq!(options.tls.as_deref(), Some("/run/ictus/rti".as_ref()));
+        assert_eq!(parse("-n 1").unwrap().tls, None);
+    }
 
     fn parse(line: &str) -> Result<Options, UsageError> {
         match Options::parse(line.split_whitespace().map(OsString::from))? {

@@ -3,12 +3,14 @@
 use std::io::{self, Read};
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::os::fd::BorrowedFd;
+use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use ictus_clock::{HostClock, Lookout, ask_often, give_up};
 use ictus_coord::auth::Nonce;
 use ictus_coord::rti::{ConnectionId, Disconnect, Newcomer, Rti, RtiEvent};
 use ictus_core::PhysicalTime;
+use ictus_stream::{Credentials, CredentialsError, Member, Stream};
 use mio::net::{TcpListener, UnixStream};
 use mio::{Events, Interest, Poll, Token};
 use rustix::io::Errno;
@@ -53,6 +55,8 @@ pub struct Server {
     /// Whether other hosts still answer.
     lookout: Lookout<usize>,
     failure_timeout: ictus_core::Duration,
+    /// What it shows; absent: connections are in the clear.
+    credentials: Option<Credentials>,
     buffer: Vec<u8>,
     port: u16,
     /// Nobody chose the address: only this host's federates can join.
@@ -97,6 +101,14 @@ pub enum BindError {
         /// Why.
         source: io::Error,
     },
+    /// The files of `--tls` are not the RTI's certificate and key.
+    #[error("`--tls {}`: {source}", directory.display())]
+    Credentials {
+        /// Where they should be.
+        directory: PathBuf,
+        /// Why.
+        source: CredentialsError,
+    },
     /// The system refuses to wait for sockets or signals.
     #[error("cannot wait for events: {0}")]
     Poll(#[from] io::Error),
@@ -110,6 +122,7 @@ impl Server {
     /// When the address cannot be listened on.
     pub fn bind(options: &Options, mut status: Status) -> Result<Self, BindError> {
         let address = SocketAddr::new(options.bind, options.port);
+        let credentials = options.tls.as_deref().map(credentials).transpose()?;
         let mut listener = TcpListener::bind(address).map_err(|source| {
             if source.kind() == io::ErrorKind::AddrInUse {
                 BindError::InUse {
@@ -149,6 +162,7 @@ impl Server {
             allow: options.allow.clone(),
             lookout: Lookout::new(options.failure_timeout),
             failure_timeout: options.failure_timeout,
+            credentials,
             bind_is_default: options.bind_is_default,
         })
     }
@@ -379,11 +393,17 @@ impl Server {
                 .registry()
                 .register(&mut stream, Token(id.index()), interest)
         });
-        if let Err(error) = ready {
-            self.rti
-                .disconnect(now, id, &Disconnect::Error(error.to_string()));
-            return;
-        }
+        let ready = ready.and_then(|()| match &self.credentials {
+            Some(credentials) => credentials.accept(stream),
+            None => Ok(Stream::plain(stream)),
+        });
+        let stream = match ready {
+            Ok(stream) => stream,
+            Err(error) => {
+                let why = Disconnect::Error(error.to_string());
+                return self.rti.disconnect(now, id, &why);
+            }
+        };
         if self.sockets.len() <= id.index() {
             self.sockets.resize_with(id.index() + 1, || None);
         }
@@ -478,6 +498,13 @@ fn reference(options: &Options) -> HostClock {
     } else {
         HostClock::steady()
     }
+}
+
+fn credentials(directory: &Path) -> Result<Credentials, BindError> {
+    Credentials::load(directory, Member::Rti).map_err(|source| BindError::Credentials {
+        directory: directory.to_path_buf(),
+        source,
+    })
 }
 
 fn open_probes(poll: &Poll, options: &Options) -> Result<Probing, BindError> {

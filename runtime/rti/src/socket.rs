@@ -1,11 +1,12 @@
 //! One connection: bytes in to the state machine, bytes out of its output.
 
-use std::io::{ErrorKind, Read, Write};
+use std::io::ErrorKind;
 use std::net::{IpAddr, Shutdown, SocketAddr};
 use std::os::fd::{AsFd, BorrowedFd};
 
 use ictus_clock::{HostClock, other_host};
 use ictus_coord::rti::{Closing, ConnectionId, Disconnect, Output, Rti};
+use ictus_stream::{Member, Stream};
 use mio::net::TcpStream;
 
 /// The most that is read from one socket before others have their turn (bytes).
@@ -18,7 +19,9 @@ const FAREWELL: usize = 4 << 20;
 /// A connection's socket and what it has sent of an incomplete message.
 #[derive(Debug)]
 pub(crate) struct Socket {
-    stream: TcpStream,
+    stream: Stream<TcpStream>,
+    /// The federate whose certificate it has shown, once the state machine knows.
+    certified: Option<u16>,
     /// The peer's host, when it is another one.
     host: Option<IpAddr>,
     leftover: Vec<u8>,
@@ -60,10 +63,11 @@ pub(crate) enum Flushed {
 }
 
 impl Socket {
-    pub(crate) fn new(stream: TcpStream, peer: SocketAddr) -> Self {
+    pub(crate) fn new(stream: Stream<TcpStream>, peer: SocketAddr) -> Self {
         Self {
-            host: other_host(stream.local_addr(), peer),
+            host: other_host(stream.tcp().local_addr(), peer),
             stream,
+            certified: None,
             leftover: Vec::new(),
             readable: true,
             read_to_end: false,
@@ -75,11 +79,11 @@ impl Socket {
 
     /// What is watched: the peer's host, when it is another one, and the socket.
     pub(crate) fn watched(&self) -> Option<(IpAddr, BorrowedFd<'_>)> {
-        self.host.map(|host| (host, self.stream.as_fd()))
+        self.host.map(|host| (host, self.stream.tcp().as_fd()))
     }
 
     pub(crate) const fn stream_mut(&mut self) -> &mut TcpStream {
-        &mut self.stream
+        self.stream.tcp_mut()
     }
 
     /// Reads once, at most [`READ`] bytes, and hands complete messages to the state machine with the time after
@@ -107,6 +111,7 @@ impl Socket {
         buffer[..kept].copy_from_slice(&self.leftover);
         let room = buffer.len() - kept;
         let result = self.stream.read(&mut buffer[kept..]);
+        self.certify(rti, id);
         match self.judge(result, room) {
             Ok(0) => Received::Open,
             Ok(read) => {
@@ -125,6 +130,7 @@ impl Socket {
         let kept = self.leftover.len();
         self.leftover.resize(kept + READ, 0);
         let result = self.stream.read(&mut self.leftover[kept..]);
+        self.certify(rti, id);
         let judged = self.judge(result, READ);
         self.leftover
             .truncate(kept + judged.as_ref().map_or(0, |&read| read));
@@ -142,12 +148,22 @@ impl Socket {
         }
     }
 
+    /// Tells the state machine who is there, before anything that it says. What waited for that is written.
+    fn certify(&mut self, rti: &mut Rti, id: ConnectionId) {
+        if let (None, Some(Member::Federate(federate))) = (self.certified, self.stream.peer()) {
+            self.certified = Some(federate);
+            rti.certify(id, federate);
+            // Whether it is to be closed is found again when its turn to be written comes.
+            let _later = self.flush(rti.output(id));
+        }
+    }
+
     /// Whether more can be read at once; 0 bytes: not now. A short read has emptied the socket, unless its end is near.
     fn judge(&mut self, result: std::io::Result<usize>, room: usize) -> Result<usize, Disconnect> {
         match result {
             Ok(0) => Err(Disconnect::Eof),
             Ok(read) => {
-                self.readable = read == room || self.read_to_end;
+                self.readable = read == room || self.read_to_end || self.stream.has_more();
                 if self.leaving {
                     self.farewell += read;
                 }
@@ -159,6 +175,10 @@ impl Socket {
                 Ok(0)
             }
             Err(error) if error.kind() == ErrorKind::ConnectionReset => Err(Disconnect::Reset),
+            Err(error) if error.kind() == ErrorKind::UnexpectedEof => Err(Disconnect::Cut),
+            Err(error) if self.stream.failure().is_some() => {
+                Err(Disconnect::Unfit(error.to_string()))
+            }
             Err(error) => Err(Disconnect::Error(error.to_string())),
         }
     }
@@ -177,22 +197,35 @@ impl Socket {
                 Ok(written) => output.advance(written),
                 Err(error) if error.kind() == ErrorKind::Interrupted => {}
                 Err(error) if error.kind() == ErrorKind::WouldBlock => return Flushed::Open,
-                Err(_) => {
-                    // What the peer sent before it went still counts: read on, to the end.
-                    self.writing = Writing::Broken;
-                    self.readable = true;
-                    self.read_to_end = true;
-                }
+                Err(_) => self.give_up_writing(),
             }
         }
-        if output.closing() == Closing::AfterFlush && self.writing == Writing::Open {
-            self.writing = Writing::Shut;
-            // A peer that is gone already needs no farewell.
-            let _gone = self.stream.shutdown(Shutdown::Write);
-            if self.farewell >= FAREWELL {
-                return Flushed::Close;
-            }
+        if self.writing != Writing::Open {
+            return Flushed::Open;
+        }
+        let last = output.closing() == Closing::AfterFlush;
+        let left = match last {
+            true => self.stream.finish(),
+            false => self.stream.flush(),
+        };
+        match left {
+            Err(error) if error.kind() == ErrorKind::WouldBlock => return Flushed::Open,
+            Ok(()) if last => self.writing = Writing::Shut,
+            Ok(()) => return Flushed::Open,
+            Err(_) => self.give_up_writing(),
+        }
+        // A peer that is gone already needs no farewell.
+        let _gone = self.stream.tcp().shutdown(Shutdown::Write);
+        if last && self.farewell >= FAREWELL {
+            return Flushed::Close;
         }
         Flushed::Open
+    }
+
+    /// What the peer sent before it went still counts: it is read on, to the end.
+    const fn give_up_writing(&mut self) {
+        self.writing = Writing::Broken;
+        self.readable = true;
+        self.read_to_end = true;
     }
 }

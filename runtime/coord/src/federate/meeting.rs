@@ -69,6 +69,18 @@ impl Federate {
         link.peers.accepted()
     }
 
+    /// The other end of `stream` has shown the certificate of `federate`: it is taken for no other.
+    pub fn peer_certified(&mut self, stream: PeerStream, federate: u16) {
+        if let Some(link) = &mut self.link {
+            link.peers.certify(stream, federate);
+        }
+    }
+
+    /// Somebody who has connected was refused by the driver before a hello, for this reason.
+    pub fn peer_unfit(&mut self, words: String) {
+        self.count_refused(words);
+    }
+
     /// Bytes for the other end of `stream`, in order; the driver takes what it has written from the front.
     ///
     /// # Panics
@@ -183,13 +195,18 @@ impl Federate {
             }
         };
         link.peers.refuse(stream, refusal.0);
+        self.count_refused(refusal.1);
+        Ok(bytes.len())
+    }
+
+    /// Counts a stranger, and says why it was refused.
+    fn count_refused(&mut self, words: String) {
         self.counters.refused += 1;
-        // Strangers may come without end.
+        // They may come without end.
         let count = self.counters.refused;
         if count <= 10 || 10_u64.pow(count.ilog10()) == count {
-            self.events.push_back(FederateEvent::PeerRefused(refusal.1));
+            self.events.push_back(FederateEvent::PeerRefused(words));
         }
-        Ok(bytes.len())
     }
 
     fn take_greeting(

@@ -41,6 +41,8 @@ pub(super) enum Role {
 struct Stream {
     role: Role,
     out: Vec<u8>,
+    /// Whose certificate the other end has shown, where there are any.
+    certified: Option<u16>,
 }
 
 /// How far the connection to one receiver is.
@@ -213,8 +215,18 @@ impl Peers {
         self.add(Role::Stranger, Vec::new())
     }
 
+    /// The other end of `stream` has the certificate of this federate.
+    pub(super) fn certify(&mut self, stream: PeerStream, federate: u16) {
+        self.streams[stream.0].certified = Some(federate);
+    }
+
     fn add(&mut self, role: Role, out: Vec<u8>) -> PeerStream {
-        self.streams.push(Stream { role, out });
+        let certified = None;
+        self.streams.push(Stream {
+            role,
+            out,
+            certified,
+        });
         PeerStream(self.streams.len() - 1)
     }
 
@@ -236,6 +248,14 @@ impl Peers {
         if federation != self.federation {
             let words = format!("federate {federate} of another federation wants to send here");
             return Err((RejectReason::FederationId, words));
+        }
+        if let Some(other) = self.streams[stream.0].certified
+            && other != federate
+        {
+            let words = format!(
+                "federate {other}, by its certificate, says that it is federate {federate}"
+            );
+            return Err((RejectReason::HmacWrong, words));
         }
         match self.senders.iter_mut().find(|(peer, _)| *peer == federate) {
             None => {

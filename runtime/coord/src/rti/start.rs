@@ -79,7 +79,13 @@ impl Rti {
             Hello::Proven { federate: proven } => Some(proven).filter(|&proven| proven != federate),
             Hello::Silent | Hello::Challenged { .. } => None,
         };
-        let refusal = if let Some(other) = other {
+        let certified = self.connections[id.0].certified;
+        let refusal = if let Some(other) = certified.filter(|&other| other != federate) {
+            let words = format!(
+                "it has the certificate of federate {other}, and says that it is {federate}"
+            );
+            Some((RejectReason::HmacWrong, words))
+        } else if let Some(other) = other {
             let words =
                 format!("it authenticated as federate {other}, and says that it is {federate}");
             Some((RejectReason::HmacWrong, words))

@@ -3,6 +3,7 @@
 use crate::assembly::AssemblyError;
 use crate::clock_sync::ClockRefusal;
 use ictus_coord::report::exit;
+use ictus_stream::CredentialsError;
 use std::io;
 use std::net::SocketAddr;
 use std::path::PathBuf;
@@ -69,6 +70,14 @@ pub enum RunError {
         /// Why.
         source: io::Error,
     },
+    /// The files of `--tls` are not this federate's certificate and key.
+    #[error("--tls {}: {source}", .directory.display())]
+    Credentials {
+        /// Where they should be.
+        directory: PathBuf,
+        /// Why.
+        source: CredentialsError,
+    },
     /// The plan and the program do not fit.
     #[error(transparent)]
     Assembly(#[from] AssemblyError),
@@ -98,7 +107,7 @@ impl RunError {
     pub fn exit_code(&self) -> u8 {
         match self {
             Self::UnknownFederate { .. } | Self::NeedsRti | Self::BadAddress { .. } => exit::USAGE,
-            Self::Connect { .. } => exit::NOT_JOINED,
+            Self::Connect { .. } | Self::Credentials { .. } => exit::NOT_JOINED,
             Self::Clock(_) => exit::CLOCK,
             Self::ReadPlan { .. }
             | Self::NoPlan { .. }
