@@ -21,6 +21,7 @@ use crate::secrets::Secrets;
 use crate::session::{Session, request};
 
 mod again;
+mod certificates;
 mod execute;
 mod images;
 mod observe;
@@ -160,6 +161,7 @@ impl<'a> Rollout<'a> {
             engine: spec.engine,
             ports: spec.ports,
             programs: here.iter().filter_map(program).collect(),
+            security: self.placement.security,
         };
         let mut request = request(self.checked, self.trace);
         for run in &mut request.federates {

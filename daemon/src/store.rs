@@ -177,6 +177,16 @@ impl Directory {
         self.specs().join(format!("{member}.json"))
     }
 
+    /// A member's certificate and key: [`ictus_stream::Papers::FILES`].
+    pub(crate) fn papers(&self, member: &str) -> PathBuf {
+        self.all_papers().join(member)
+    }
+
+    /// The certificates and keys of all members.
+    pub(crate) fn all_papers(&self) -> PathBuf {
+        self.0.join("tls")
+    }
+
     pub(crate) fn specs(&self) -> PathBuf {
         self.0.join("spec")
     }
@@ -353,7 +363,13 @@ impl Directory {
                 return Ok(Vec::new());
             }
         }
-        for path in [self.request(), self.record(), self.measures(), self.specs()] {
+        for path in [
+            self.request(),
+            self.record(),
+            self.measures(),
+            self.specs(),
+            self.all_papers(),
+        ] {
             files::remove(&path).map_err(io_at(&path))?;
         }
         let left = [
@@ -377,6 +393,7 @@ impl Directory {
             self.request(),
             self.measures(),
             self.specs(),
+            self.all_papers(),
             self.trace(),
             self.timing(),
             self.work(),

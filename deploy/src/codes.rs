@@ -192,9 +192,10 @@ pub(crate) const CODES: &[(&str, &str)] = &[
     ),
     (
         "F034",
-        "Messages between hosts are in clear text: whoever is in the hosts' network can read them, join the \
-         federation and stop it. `security: trusted-network` says that this is known, and is required as \
-         soon as `hosts` has more than one. `mtls` (certificates) is not there yet.",
+        "Messages between hosts are under TLS, with certificates that `ictus up` makes for each run \
+         (`security: mtls`, the default). Lingua Franca's federates, which have a `binary` or an `image` and an \
+         `id`, speak none: with one of them `security: trusted-network` says that all goes in clear text, and \
+         that this is known: whoever is in the hosts' network can read messages, join the federation and stop it.",
     ),
     (
         "F035",

@@ -8,8 +8,8 @@ use ictus_coord::plan::Coordination;
 
 use crate::check::Deploy;
 use crate::federation::{Member, Origin};
-use crate::manifest::{Host, Manifest, Port, PortsText, Security};
-use crate::placement::{Engine, HostSpec, Placement, PortRange, Way};
+use crate::manifest::{Host, Manifest, Port, PortsText};
+use crate::placement::{Engine, HostSpec, Placement, PortRange, Security, Way};
 use crate::problem::{Place, Report};
 use crate::suggest;
 
@@ -70,12 +70,14 @@ impl<'a> Seating<'a> {
             contained: false,
             placement: None,
         };
-        security(manifest, report);
         let drafts: Vec<Draft> = hosts
             .iter()
             .map(|(name, host)| Draft::of(name, host, outside, report))
             .collect();
         let used = seating.used();
+        if used.len() > 1 {
+            security(manifest, members, report);
+        }
         for (index, (name, host)) in hosts.iter().enumerate() {
             if seating.is_whole() && !used.contains(&index) {
                 let message = format!("nothing runs on the host `{name}`");
@@ -88,7 +90,8 @@ impl<'a> Seating<'a> {
             reachable(hosts, &drafts, &used, report);
         }
         seating.ports(manifest, &drafts, report);
-        seating.placement = seating.place(&drafts);
+        let security = manifest.security.unwrap_or(Security::Mtls);
+        seating.placement = seating.place(&drafts, security);
         seating
     }
 
@@ -185,7 +188,7 @@ impl<'a> Seating<'a> {
         }
     }
 
-    fn place(&self, drafts: &[Draft]) -> Option<Placement> {
+    fn place(&self, drafts: &[Draft], security: Security) -> Option<Placement> {
         let mut used: Vec<usize> = self.used().into_iter().collect();
         used.sort_by_key(|index| self.hosts.get(*index).map(|(name, _)| name));
         let alone = used.len() == 1;
@@ -211,6 +214,10 @@ impl<'a> Seating<'a> {
             federates: federates
                 .map(|at| position(Some((*at)?)))
                 .collect::<Option<_>>()?,
+            security: match alone {
+                true => Security::TrustedNetwork,
+                false => security,
+            },
         })
     }
 }
@@ -293,22 +300,26 @@ fn unseated(homeless: &[&str], rti: bool, manifest: &Manifest, report: &mut Repo
     }
 }
 
-/// What goes between hosts is in clear text, and who deploys must have said that he knows.
-fn security(manifest: &Manifest, report: &mut Report) {
-    match manifest.security {
-        Some(Security::Mtls) => {
-            let message = "`mtls` is not there yet: messages between hosts are in clear text";
-            let fix =
-                "write `security: trusted-network`, and let nobody else into the hosts' network";
-            report.add("F034", Place::value(&["security"]), message, fix);
-        }
-        None if manifest.hosts.0.len() > 1 && !report.is_broken(&["security"]) => {
-            let message = "messages between hosts are in clear text, and `security` does not say that this is known";
-            let fix = "add `security: trusted-network` when nobody else is in the hosts' network";
-            report.add("F034", Place::key(&["hosts"]), message, fix);
-        }
-        None | Some(Security::TrustedNetwork) => {}
+/// Lingua Franca's federates speak no TLS: where one is, who deploys must have said that the network is trusted.
+fn security(manifest: &Manifest, members: &[Member<'_>], report: &mut Report) {
+    if manifest.security == Some(Security::TrustedNetwork) || report.is_broken(&["security"]) {
+        return;
     }
+    let mut foreign = members.iter().filter(|member| member.is_foreign());
+    let Some(first) = foreign.next() else { return };
+    let name = first.name;
+    let message = match foreign.count() {
+        0 => format!("`{name}` is a Lingua Franca federate, and those speak no TLS"),
+        more => {
+            format!("`{name}` and {more} more are Lingua Franca federates, and those speak no TLS")
+        }
+    };
+    let place = match manifest.security {
+        Some(_) => Place::value(&["security"]),
+        None => Place::key(&["federates", name]),
+    };
+    let fix = "write `security: trusted-network`, and let nobody else into the hosts' network";
+    report.add("F034", place, message, fix);
 }
 
 /// What is understood of one host.

@@ -12,7 +12,7 @@ use serde_json::Value;
 
 use crate::check::Deploy;
 
-pub(crate) use self::host::{Host, PortsText, Security};
+pub(crate) use self::host::{Host, PortsText};
 pub(crate) use self::needs::{RealtimeText, Secret, VolumeText};
 pub(crate) use self::scalar::{
     Address, ByteSize, LinkMap, Named, OffsetText, OneOrMany, Port, Scalar, SignedSpan, TimeSpan,
@@ -23,6 +23,7 @@ use self::words::{
     ClockSyncWord, CoordinationWord, DeployWord, OnExceedWord, OnFailureWord, SecurityWord,
     WireWord,
 };
+use crate::placement::Security;
 
 /// A federation: what runs, how it is connected, and how long.
 ///

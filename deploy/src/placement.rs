@@ -27,6 +27,17 @@ pub struct PortRange {
     pub last: u16,
 }
 
+/// What protects the messages between hosts.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Security {
+    /// Nothing but the network; or there are none.
+    #[default]
+    TrustedNetwork,
+    /// TLS 1.3, and a certificate at both ends that is made for the run.
+    Mtls,
+}
+
 /// Which program speaks ssh.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
@@ -83,6 +94,9 @@ pub struct Placement {
     pub rti: usize,
     /// Index of each federate's host, in the plan's order.
     pub federates: Vec<usize>,
+    /// What protects the messages between them.
+    #[serde(default)]
+    pub security: Security,
 }
 
 /// A scheduling policy of the kernel.

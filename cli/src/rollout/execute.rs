@@ -16,7 +16,7 @@ use ictusd::{identity, stamp};
 use tokio::task::JoinSet;
 
 use super::observe::{is_unknown, view};
-use super::{Rollout, listed};
+use super::{Rollout, certificates, listed};
 use crate::commands::events::describe;
 use crate::error::{CliError, Kind};
 use crate::hosts::Clients;
@@ -123,9 +123,11 @@ impl Executor {
                 generation: Some(rollout.generation),
                 request,
                 secrets: secrets.only(&wanted.federates),
+                papers: BTreeMap::new(),
             };
             requests.insert(host.clone(), prepare);
         }
+        certificates::hand_out(&run, requests.values_mut())?;
         let rti_host = rollout.placement.hosts.get(rollout.placement.rti);
         let rti = rti_host
             .map(|host| host.name.clone())

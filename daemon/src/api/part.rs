@@ -21,7 +21,8 @@ use std::net::{Ipv4Addr, SocketAddrV4};
 use std::path::PathBuf;
 
 use ictus_deploy::gives::Gives;
-use ictus_deploy::placement::{Engine, PortRange, Way};
+use ictus_deploy::placement::{Engine, PortRange, Security, Way};
+use ictus_stream::Papers;
 use serde::{Deserialize, Serialize};
 
 use super::StartRequest;
@@ -48,6 +49,9 @@ pub struct Part {
     /// The blob that each federate of this host executes, by name: the SHA-256 in hexadecimal digits. One that is
     /// missing here executes its path.
     pub programs: BTreeMap<String, String>,
+    /// What protects the messages between hosts.
+    #[serde(default, skip_serializing_if = "is_clear")]
+    pub security: Security,
 }
 
 /// The way to a host.
@@ -81,6 +85,17 @@ pub struct PrepareRequest {
     /// The values of the secrets of this host's federates; not kept with the request.
     #[serde(default, skip_serializing_if = "SecretValues::is_empty")]
     pub secrets: SecretValues,
+    /// The certificate and key of each member of this host (`rti`, or the federate's name), when there are to be any.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub papers: BTreeMap<String, Papers>,
+}
+
+#[expect(
+    clippy::trivially_copy_pass_by_ref,
+    reason = "serde calls it with a reference"
+)]
+fn is_clear(security: &Security) -> bool {
+    *security == Security::TrustedNetwork
 }
 
 /// A part that waits for its commit.

@@ -13,6 +13,7 @@ use std::time::Duration;
 use ictus_deploy::Needs;
 use ictus_deploy::image::elf::Machine;
 use ictus_deploy::image::{Archive, ImageConfig, PROGRAM};
+use ictus_stream::Papers;
 use tokio::net::UnixStream;
 use tokio::time::{Instant, sleep, timeout};
 
@@ -137,6 +138,10 @@ impl Contained {
         let mut directories = vec![run.directory.logs(), run.directory.work()];
         directories.extend([run.directory.trace(), run.directory.timing()]);
         directories.extend(exits);
+        let mut files = vec![run.directory.plan(), run.directory.spec(member_name)];
+        if let Some(papers) = run.papers(member_name) {
+            files.extend(Papers::FILES.map(|file| papers.join(file)));
+        }
         Some(Self {
             name,
             labels: labels
@@ -153,7 +158,7 @@ impl Contained {
                     let kept = run.record.secrets.as_ref()?;
                     Some(secrets::directory(kept, &federate.name))
                 }),
-            files: vec![run.directory.plan(), run.directory.spec(member_name)],
+            files,
             directories,
             socket_directory: supervised
                 .socket

@@ -4,6 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::net::{Ipv4Addr, SocketAddrV4};
 use std::path::{Path, PathBuf};
 
+use ictus_deploy::placement::Security;
 use ictus_deploy::{Engine, FederateKind, FederateRun};
 
 use crate::agent::{MemberId, RTI};
@@ -154,7 +155,21 @@ impl Run<'_> {
                 args.extend(["--clock-port".to_owned(), port.to_string()]);
             }
         }
+        args.extend(self.tls_args(RTI));
         args
+    }
+
+    /// Where a member's certificate and key are, if it has any.
+    pub(super) fn papers(&self, member: &str) -> Option<PathBuf> {
+        let part = self.request.part.as_ref();
+        part.filter(|part| part.security == Security::Mtls)
+            .map(|_| self.directory.papers(member))
+    }
+
+    fn tls_args(&self, member: &str) -> Vec<String> {
+        let directory = self.papers(member);
+        let directory = directory.map(|path| path.to_string_lossy().into_owned());
+        directory.map_or_else(Vec::new, |path| vec!["--tls".to_owned(), path])
     }
 
     fn federate_args(&self, run: &FederateRun, rti: SocketAddrV4) -> Vec<String> {
@@ -181,6 +196,7 @@ impl Run<'_> {
                 if let Some(port) = self.record.ports.get(&run.name) {
                     args.extend(["--data-port".to_owned(), port.to_string()]);
                 }
+                args.extend(self.tls_args(&run.name));
                 if self.request.trace {
                     args.extend(["--trace".to_owned(), path(&directory.trace())]);
                 }

@@ -1,10 +1,11 @@
 //! What federates need from this host besides their programs: whether they get it, and their secrets.
 
 use std::fs::{self, Permissions};
-use std::os::unix::fs::PermissionsExt;
+use std::os::unix::fs::{PermissionsExt, chown};
 use std::path::Path;
 
 use ictus_deploy::{Engine, FederateRun, Needs};
+use ictus_stream::Papers;
 
 use super::{Host, error, error_of, recorded, store_error, with_sources};
 use crate::accounts::{self, Account};
@@ -102,6 +103,19 @@ impl Host {
         let programs = part.into_iter().flat_map(|part| part.programs.values());
         for program in programs {
             set_mode(&paths.blobs().join(program), 0o755)?;
+        }
+        for run in here(request).filter(|run| directory.papers(&run.name).exists()) {
+            let Some(account) = account(request, run)? else {
+                continue;
+            };
+            enter(&directory.all_papers())?;
+            let papers = directory.papers(&run.name);
+            let files = Papers::FILES.map(|file| papers.join(file));
+            for path in files.iter().chain([&papers]) {
+                chown(path, Some(account.uid), Some(account.gid)).map_err(|error| {
+                    error_of(format!("cannot give {} to its user: {error}", path.display()))
+                })?;
+            }
         }
         set_mode(&directory.plan(), 0o644)
     }

@@ -4,8 +4,9 @@ use std::collections::BTreeSet;
 use std::io::Read;
 
 use ictus_deploy::Engine;
+use ictus_deploy::placement::Security;
 
-use crate::agent::MemberId;
+use crate::agent::{MemberId, RTI};
 use crate::api::part::{
     CommitRequest, Lease, LeaseRequest, LeaseView, Part, PrepareRequest, Prepared,
 };
@@ -121,6 +122,7 @@ impl Host {
             return Err(bad("the run's id is none"));
         }
         validate_part(part, request.federates.len()).map_err(|what| bad(&what))?;
+        validate_papers(part, prepare).map_err(|what| bad(&what))?;
         self.check_previous(name, prepare)?;
         self.check_driven(name)?;
         let programs: Vec<_> = part.programs.values().cloned().collect();
@@ -140,6 +142,13 @@ impl Host {
             store_error(&error)
         })?;
         record.secrets = secrets;
+        for (member, papers) in &prepare.papers {
+            let path = directory.papers(member);
+            papers.write(&path).map_err(|source| {
+                self.remove_secrets(name).ok();
+                store_error(&StoreError::Io { path, source })
+            })?;
+        }
         self.admit_users(&directory, request)?;
         record.view.rti_port = ports.rti;
         record.ports = ports.federates;
@@ -328,6 +337,26 @@ fn validate_part(part: &Part, federates: usize) -> Result<(), String> {
         return Err(format!("host `{}` is not among the hosts", part.host));
     }
     Ok(())
+}
+
+/// Every member of this host must have a certificate, or none.
+fn validate_papers(part: &Part, prepare: &PrepareRequest) -> Result<(), String> {
+    let federates = &prepare.request.federates;
+    let names = part.federates.iter();
+    let names = names.filter_map(|id| federates.get(usize::from(*id)));
+    let names = names.map(|run| run.name.as_str());
+    let mut members: BTreeSet<&str> = names.chain(part.rti.then_some(RTI)).collect();
+    if part.security == Security::TrustedNetwork {
+        members.clear();
+    }
+    let given: BTreeSet<&str> = prepare.papers.keys().map(String::as_str).collect();
+    match given.symmetric_difference(&members).next() {
+        Some(name) if given.contains(name) => {
+            Err(format!("a certificate for `{name}` is of no use here"))
+        }
+        Some(name) => Err(format!("there is no certificate for `{name}`")),
+        None => Ok(()),
+    }
 }
 
 fn held(lease: &LeaseError) -> ApiError {

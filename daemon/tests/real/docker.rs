@@ -445,6 +445,7 @@ async fn images_are_made_before_anything_runs() {
         generation: None,
         request: rig.request(&[("a", ""), ("b", "")]),
         secrets: SecretValues::default(),
+        papers: BTreeMap::new(),
     };
     prepare.request.federates[1].needs.image = Some("127.0.0.1:1/no-such-image:1".to_owned());
     let refused = world.client.prepare((name, fence), &prepare).await;

@@ -2,11 +2,13 @@
 
 use std::collections::BTreeMap;
 use std::net::{Ipv4Addr, SocketAddrV4, TcpListener};
+use std::os::unix::fs::PermissionsExt as _;
 use std::sync::Arc;
 use std::sync::atomic::AtomicU64;
 
 use ictus_deploy::Engine;
-use ictus_deploy::placement::{PortRange, Way};
+use ictus_deploy::placement::{PortRange, Security, Way};
+use ictus_stream::Papers;
 use ictusd::api::part::{CommitRequest, HostRef, LeaseRequest, Part, PrepareRequest};
 use ictusd::api::secret::SecretValues;
 use ictusd::api::{ErrorCode, Event, ExitReason, Outcome, StartRequest, State};
@@ -37,6 +39,7 @@ fn part(request: &StartRequest, host: &str, digest: &str) -> StartRequest {
         engine: Engine::Process,
         ports: None,
         programs: BTreeMap::from([(name.to_owned(), digest.to_owned())]),
+        security: Security::TrustedNetwork,
     };
     StartRequest {
         part: Some(part),
@@ -53,6 +56,7 @@ fn prepare(request: StartRequest, previous: Option<&str>) -> PrepareRequest {
         generation: None,
         request,
         secrets: SecretValues::default(),
+        papers: BTreeMap::new(),
     }
 }
 
@@ -155,6 +159,67 @@ async fn two_parts_become_one_federation_and_end_together() {
         assert!(!world.paths.blobs().exists(), "programs are left");
         assert!(!world.paths.leases().exists(), "leases are left");
     }
+}
+
+#[tokio::test]
+async fn keys_are_in_files_of_their_members_and_nowhere_else() {
+    const CANARY: &str = "canary-of-a-key";
+    let world = World::new().await;
+    let fence = lease(&world).await;
+    let mut request = part(&federation(&[("a", ""), ("b", "")]), "one", &digest());
+    if let Some(part) = &mut request.part {
+        part.security = Security::Mtls;
+        part.programs.clear();
+    }
+    let mut prepare = prepare(request, None);
+    let papers = Papers {
+        authority: "an authority".to_owned(),
+        certificate: "a certificate".to_owned(),
+        key: CANARY.to_owned(),
+    };
+    prepare.papers.insert("rti".to_owned(), papers.clone());
+    let error = world.client.prepare((NAME, fence), &prepare).await;
+    let refused = |what: &str| (ErrorCode::BadRequest, what.to_owned());
+    let missing = refused("there is no certificate for `a`");
+    assert_eq!(refusal(error.unwrap_err()), missing);
+    prepare.papers.insert("a".to_owned(), papers.clone());
+    prepare.papers.insert("b".to_owned(), papers);
+    let error = world.client.prepare((NAME, fence), &prepare).await;
+    let odd = refused("a certificate for `b` is of no use here");
+    assert_eq!(refusal(error.unwrap_err()), odd);
+    prepare.papers.remove("b");
+    world.client.prepare((NAME, fence), &prepare).await.unwrap();
+    let mut found = Vec::new();
+    let mut directories = vec![world.paths.federations()];
+    while let Some(directory) = directories.pop() {
+        for entry in std::fs::read_dir(directory).unwrap() {
+            let (path, kind) = entry
+                .map(|it| (it.path(), it.file_type().unwrap()))
+                .unwrap();
+            if kind.is_dir() {
+                directories.push(path);
+            } else if std::fs::read_to_string(&path).unwrap().contains(CANARY) {
+                assert_eq!(path.metadata().unwrap().permissions().mode() & 0o777, 0o600);
+                found.push(
+                    path.strip_prefix(world.paths.federations())
+                        .unwrap()
+                        .to_owned(),
+                );
+            }
+        }
+    }
+    found.sort();
+    let expected = ["a", "rti"].map(|member| format!("{NAME}/tls/{member}/key.pem").into());
+    assert_eq!(found, expected);
+    world
+        .client
+        .remove_part((NAME, fence), false)
+        .await
+        .unwrap();
+    let left = world.paths.federations().join(NAME).join("tls");
+    assert!(!left.exists(), "keys are left");
+    world.client.remove_part((NAME, fence), true).await.unwrap();
+    world.client.release(NAME, fence).await.unwrap();
 }
 
 #[tokio::test]

@@ -75,13 +75,3 @@ impl Arch {
         }
     }
 }
-
-/// What protects the messages between hosts.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub(crate) enum Security {
-    /// Nothing but the network.
-    TrustedNetwork,
-    /// Certificates.
-    Mtls,
-}

@@ -111,7 +111,7 @@ pub(crate) enum SshClientWord {
 pub(crate) enum SecurityWord {
     /// Nothing but the network: whoever is on it can read and disturb.
     TrustedNetwork,
-    /// Certificates; not there yet.
+    /// TLS with certificates that `ictus up` makes; the default.
     Mtls,
 }
 

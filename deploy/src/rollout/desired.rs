@@ -334,6 +334,7 @@ fn facets(
         ("timing".to_owned(), serde_json::to_value(&checked.timing)?),
         ("trace".to_owned(), json!(trace)),
         ("rti/host".to_owned(), json!(host(placement.rti))),
+        ("security".to_owned(), json!(placement.security)),
     ];
     for spec in &placement.hosts {
         let facet = json!({ "engine": spec.engine, "address": spec.address, "ports": spec.ports });

@@ -6,7 +6,7 @@ use std::net::Ipv4Addr;
 use std::path::{Path, PathBuf};
 
 use ictus_coord::plan::{FederatePlan, Plan};
-use ictus_deploy::placement::{SecretSource, Way};
+use ictus_deploy::placement::{SecretSource, Security, Way};
 use ictus_deploy::rollout::{Desired, DesiredError, ProgramFile};
 use ictus_deploy::{
     Checked, Engine, FederateKind, FederateRun, HostSpec, Needs, Placement, Settings, TimingSpec,
@@ -57,6 +57,7 @@ fn checked() -> Checked {
             hosts: vec![host("nuc", 1), host("pi", 2)],
             rti: 0,
             federates: vec![0, 1],
+            security: Security::Mtls,
         }),
         settings: Settings::default(),
         timing: TimingSpec::default(),
@@ -152,6 +153,10 @@ fn what_matters_counts_where_it_belongs() {
             .insert("gain".to_owned(), 2.into());
     };
     assert_eq!(touched(parameter), ["federate/b/parameters"]);
+    assert_eq!(
+        touched(|it| it.placement.as_mut().unwrap().security = Security::TrustedNetwork),
+        ["security"]
+    );
     assert_eq!(
         touched(|it| it.placement.as_mut().unwrap().federates[1] = 0),
         ["federate/b/host"]

@@ -515,6 +515,7 @@ impl Rti {
                     | Disconnect::Reset
                     | Disconnect::Cut
                     | Disconnect::Evicted
+                    | Disconnect::Silent { .. }
                     | Disconnect::Error(_) => format!("{why} before it said who it is"),
                 };
                 self.events.push_back(RtiEvent::Rejected { peer, reason });

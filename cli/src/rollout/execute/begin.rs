@@ -33,6 +33,7 @@ impl Executor {
         for request in requests.values_mut() {
             request.id.clone_from(&run);
         }
+        certificates::hand_out(&run, requests.values_mut())?;
         let work = Work {
             requests,
             rti,
