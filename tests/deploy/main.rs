@@ -12,6 +12,7 @@ mod network;
 mod operator;
 mod rows;
 mod secrets;
+mod tls;
 
 use ictus_tests::rig::{self, Rig, Snapshot};
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -34,6 +35,7 @@ const SCENARIOS: &[&[Scenario]] = &[
     rows::SCENARIOS,
     images::SCENARIOS,
     losses::SCENARIOS,
+    tls::SCENARIOS,
 ];
 
 #[expect(clippy::print_stdout, reason = "a test's report")]

@@ -118,6 +118,8 @@ fn prepare(generation: Generation, number: u64) -> Result<Option<PrepareRequest>
         generation: Some(number),
         request,
         secrets,
+        // Of the new run.
+        papers: BTreeMap::new(),
     }))
 }
 

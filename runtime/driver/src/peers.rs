@@ -394,7 +394,7 @@ mod tests {
         for (allowed, taken) in [([10, 9, 8, 7], 0), ([127, 0, 0, 1], 1)] {
             let mut federate = federate(true);
             let allowed = vec![Ipv4Addr::from(allowed)];
-            let mut peers = Peers::allowing(allowed, None, Duration::from_secs(10));
+            let mut peers = Peers::allowing(allowed.clone(), None, Duration::from_secs(10));
             peers.listen(here(), &mut federate).unwrap();
             let address = peers.listener.as_ref().unwrap().local_addr().unwrap();
             let stranger = TcpStream::connect(address).unwrap();
@@ -453,7 +453,7 @@ mod tests {
             Credentials::of(&papers).unwrap()
         };
         let mut federate = federate(true);
-        let mut peers = Peers::allowing(Vec::new(), Some(credentials(0)));
+        let mut peers = Peers::allowing(Vec::new(), Some(credentials(0)), Duration::from_secs(10));
         peers.listen(here(), &mut federate).unwrap();
         let address = peers.listener.as_ref().unwrap().local_addr().unwrap();
         let mut bytes = Vec::new();

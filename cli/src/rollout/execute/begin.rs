@@ -6,7 +6,7 @@ use ictusd::identity;
 use super::{Executor, Work};
 use crate::error::CliError;
 use crate::hosts::Clients;
-use crate::rollout::Again;
+use crate::rollout::{Again, certificates};
 
 impl Executor {
     /// Carries out what takes a federation down.
