@@ -113,7 +113,10 @@ impl Host {
             let files = Papers::FILES.map(|file| papers.join(file));
             for path in files.iter().chain([&papers]) {
                 chown(path, Some(account.uid), Some(account.gid)).map_err(|error| {
-                    error_of(format!("cannot give {} to its user: {error}", path.display()))
+                    error_of(format!(
+                        "cannot give {} to its user: {error}",
+                        path.display()
+                    ))
                 })?;
             }
         }

@@ -488,9 +488,11 @@ mod tests {
         assert_eq!(answer, FromPeer::Ack);
         assert_eq!(federate.counters().refused, 2);
         let words: Vec<_> = std::iter::from_fn(|| federate.poll_event())
-            .filter_map(|event| match event {
-                FederateEvent::PeerRefused(words) => Some(words),
-                _ => None,
+            .filter_map(|event| {
+                let FederateEvent::PeerRefused(words) = event else {
+                    return None;
+                };
+                Some(words)
             })
             .collect();
         assert!(words[0].contains("it does not speak TLS"), "{words:?}");

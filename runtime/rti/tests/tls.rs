@@ -133,9 +133,10 @@ impl Peer {
     fn next(&mut self) -> Option<(String, usize)> {
         for _ in 0..LOOKS {
             if let Some((message, length)) = ToFederate::decode(&self.unread).unwrap() {
-                let payload = match &message {
-                    ToFederate::TaggedMessage(message) => message.payload.len(),
-                    _ => 0,
+                let payload = if let ToFederate::TaggedMessage(message) = &message {
+                    message.payload.len()
+                } else {
+                    0
                 };
                 let text = format!("{message:?}");
                 let name = text.split(['(', ' ']).next().unwrap().to_owned();
