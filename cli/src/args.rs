@@ -78,9 +78,11 @@ enum Command {
     Rti(PassedOn),
     /// Serve the API; `up` starts it when it is needed
     Daemon,
-    /// Connect standard input and output to this user's daemon
     #[command(hide = true)]
-    DialStdio,
+    DialStdio(commands::dial_stdio::DialStdio),
+    /// Have the program that was sent beside this one take its place, if it comes up
+    #[command(hide = true)]
+    Swap,
     #[command(hide = true)]
     Supervise(commands::supervise::Supervise),
 }
@@ -160,7 +162,8 @@ fn run(cli: Cli) -> ExitCode {
         Command::Explain(it) => it.run(&mut ui),
         Command::Rti(it) => return ictus_rti::run(it.args),
         Command::Daemon => commands::daemon::run(),
-        Command::DialStdio => commands::dial_stdio::run(),
+        Command::DialStdio(it) => commands::dial_stdio::run(&it),
+        Command::Swap => commands::swap::run(),
         Command::Supervise(it) => it.run(),
     };
     match result {

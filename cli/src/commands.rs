@@ -18,6 +18,7 @@ pub(crate) mod ps;
 pub(crate) mod schema;
 pub(crate) mod stop;
 pub(crate) mod supervise;
+pub(crate) mod swap;
 pub(crate) mod timing;
 pub(crate) mod up;
 pub(crate) mod verify;

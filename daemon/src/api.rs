@@ -14,6 +14,8 @@
 //! | `POST /v1/end` | ends the daemon if it owns nothing |
 //! | `POST /v1/give-way` | ends the daemon whatever it owns: federations go on, and the next daemon takes them over |
 //!
+//! Whoever may only look has a socket of its own, `viewer.sock`: `GET` alone, and neither logs nor generations' requests.
+//!
 //! Errors are [`ApiError`] with a status of 400 and up.
 
 use std::collections::BTreeMap;
@@ -489,6 +491,8 @@ pub struct ApiError {
 pub enum ErrorCode {
     /// The request is malformed.
     BadRequest,
+    /// Who asks may only look.
+    Forbidden,
     /// There is no such federation.
     Unknown,
     /// A federation of this name runs, from the same plan.

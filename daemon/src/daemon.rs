@@ -15,7 +15,7 @@ use tokio::signal::unix::{SignalKind, signal};
 use crate::files;
 use crate::host::Host;
 use crate::paths::{Paths, PathsError};
-use crate::server::{OwnListener, router};
+use crate::server::{OwnListener, router, viewer};
 
 /// What a daemon prints on standard output once it, or another one, serves.
 pub const READY: &str = "ready";
@@ -79,7 +79,9 @@ pub fn run(paths: &Paths) -> Result<Served, DaemonError> {
     let served = runtime
         .map_err(system("start the runtime"))?
         .block_on(serve(paths));
-    files::remove(&paths.socket()).map_err(system("remove the socket"))?;
+    for socket in [paths.socket(), paths.viewer_socket()] {
+        files::remove(&socket).map_err(system("remove the socket"))?;
+    }
     lock.release();
     if served.is_ok() {
         clean(paths);
@@ -99,9 +101,8 @@ pub fn log_to_stderr() {
 }
 
 async fn serve(paths: &Paths) -> Result<(), DaemonError> {
-    // We hold the lock: a socket that is there is a dead daemon's.
-    files::remove(&paths.socket()).map_err(system("remove a stale socket"))?;
-    let listener = UnixListener::bind(paths.socket()).map_err(system("bind the socket"))?;
+    let listener = bind(&paths.socket())?;
+    let viewers = bind(&paths.viewer_socket())?;
     let mut terminate = signal(SignalKind::terminate()).map_err(system("watch signals"))?;
     let mut interrupt = signal(SignalKind::interrupt()).map_err(system("watch signals"))?;
     let host = Host::new(paths.clone());
@@ -112,6 +113,9 @@ async fn serve(paths: &Paths) -> Result<(), DaemonError> {
     let server = axum::serve(OwnListener(listener), router(host.clone()))
         .with_graceful_shutdown(async move { ended.await.unwrap_or(()) });
     let server = tokio::spawn(server.into_future());
+    // Who only looks is not waited for at the end.
+    let viewers = axum::serve(OwnListener(viewers), viewer::router(host.clone()));
+    let viewers = tokio::spawn(viewers.into_future());
     tokio::select! {
         () = idle(&host, idle_after()) => tracing::info!("nothing owned"),
         () = host.ended() => tracing::info!("asked to end"),
@@ -119,8 +123,15 @@ async fn serve(paths: &Paths) -> Result<(), DaemonError> {
         _ = interrupt.recv() => tracing::info!("SIGINT"),
     }
     end.send(()).ok();
+    viewers.abort();
     tokio::time::timeout(GOODBYE_MAX, server).await.ok();
     Ok(())
+}
+
+/// Listens; we hold the lock, so a socket that is there is a dead daemon's.
+fn bind(path: &Path) -> Result<UnixListener, DaemonError> {
+    files::remove(path).map_err(system("remove a stale socket"))?;
+    UnixListener::bind(path).map_err(system("bind the socket"))
 }
 
 fn idle_after() -> Duration {

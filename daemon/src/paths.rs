@@ -147,6 +147,12 @@ impl Paths {
         self.run.join("ictusd.sock")
     }
 
+    /// The socket of whoever may only look, beside the daemon's.
+    #[must_use]
+    pub fn viewer_socket(&self) -> PathBuf {
+        viewer_socket(&self.socket())
+    }
+
     /// The daemon's lock: who holds it is the daemon of this state directory, and has written its socket's path
     /// there. Sessions may differ in `XDG_RUNTIME_DIR`, so the run directory would not do.
     #[must_use]
@@ -202,6 +208,12 @@ impl Paths {
     pub fn federations(&self) -> PathBuf {
         self.state.join("federations")
     }
+}
+
+/// The socket of whoever may only look, of the daemon with this socket.
+#[must_use]
+pub fn viewer_socket(socket: &Path) -> PathBuf {
+    socket.with_file_name("viewer.sock")
 }
 
 #[cfg(test)]

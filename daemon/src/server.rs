@@ -32,6 +32,7 @@ use crate::store::Leave;
 mod parts;
 mod reach;
 mod recorded;
+pub(crate) mod viewer;
 
 /// Lines of a stream that wait for a slow client.
 const LINES_MAX: usize = 1024;
@@ -64,6 +65,7 @@ pub(crate) fn router(host: Host) -> Router {
         .route("/metrics", get(metrics))
         .merge(parts::router())
         .merge(reach::router())
+        .merge(parts::readable())
         .merge(recorded::readable())
         .merge(recorded::private())
         .fallback(async || bad_request("no such call; is the daemon of another version?"))
@@ -328,6 +330,15 @@ async fn events(
     State(host): State<Host>,
     Query(query): Query<EventsQuery>,
 ) -> Result<Response, ApiError> {
+    tell_events(&host, query, std::convert::identity)
+}
+
+/// Tells events, each as whoever asks may see it.
+fn tell_events(
+    host: &Host,
+    query: EventsQuery,
+    seen: fn(Happening) -> Happening,
+) -> Result<Response, ApiError> {
     let told = host.subscribe();
     let mut kept = Vec::new();
     let names = match &query.federation {
@@ -341,10 +352,10 @@ async fn events(
     let (lines, body) = JsonLines::new(None);
     tokio::spawn(async move {
         for happening in kept {
-            lines.send(&happening).await;
+            lines.send(&seen(happening)).await;
         }
         if query.follow {
-            pass(told, query.federation, lines).await;
+            pass(told, (query.federation, seen), lines).await;
         }
     });
     Ok(stream(body))
@@ -406,13 +417,17 @@ async fn pass_to_end(told: &mut Told, name: &str, lines: &Sender) {
 }
 
 /// Passes events on, of one federation or of all, until nobody listens.
-async fn pass(mut told: Told, federation: Option<String>, lines: Sender) {
+async fn pass(
+    mut told: Told,
+    (federation, seen): (Option<String>, fn(Happening) -> Happening),
+    lines: Sender,
+) {
     while let Some(happening) = next(&mut told, &lines).await {
         if federation
             .as_ref()
             .is_none_or(|name| *name == happening.federation)
         {
-            lines.send(&happening).await;
+            lines.send(&seen(happening)).await;
         }
     }
 }
@@ -510,6 +525,7 @@ impl IntoResponse for ApiError {
         let status = match self.code {
             ErrorCode::BadRequest => StatusCode::BAD_REQUEST,
             ErrorCode::Unknown => StatusCode::NOT_FOUND,
+            ErrorCode::Forbidden => StatusCode::FORBIDDEN,
             ErrorCode::AlreadyRunning | ErrorCode::Conflict | ErrorCode::Held => {
                 StatusCode::CONFLICT
             }

@@ -13,6 +13,7 @@ mod operator;
 mod rows;
 mod secrets;
 mod tls;
+mod verbs;
 
 use ictus_tests::rig::{self, Rig, Snapshot};
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -36,6 +37,7 @@ const SCENARIOS: &[&[Scenario]] = &[
     images::SCENARIOS,
     losses::SCENARIOS,
     tls::SCENARIOS,
+    verbs::SCENARIOS,
 ];
 
 #[expect(clippy::print_stdout, reason = "a test's report")]

@@ -8,11 +8,9 @@
 
 use std::fs;
 use std::os::unix::fs::PermissionsExt;
-use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
 use std::time::Instant;
 
-use ictus_deploy::trace::{TraceSet, Verdict, compare};
 use ictus_tests::rig::{Host, Rig};
 use ictus_tests::{ictus, root, said};
 use serde_json::Value;
@@ -158,63 +156,26 @@ pub(crate) fn spread(rig: &Rig, example: &str, head: &str) -> String {
     spread
 }
 
-/// The traces that the hosts have, in one directory.
-pub(crate) fn gather(rig: &Rig, name: &str, into: &Path) {
-    fs::create_dir_all(into).unwrap();
-    for host in rig.hosts() {
-        let directory = format!("/home/robot/.local/state/ictus/federations/{name}/trace");
-        let listed = host.exec(&["ls", &directory]);
-        for file in listed.lines() {
-            let text = host.exec(&["cat", &format!("{directory}/{file}")]);
-            fs::write(into.join(file), text).unwrap();
-        }
-    }
-}
-
-/// The trace of one process from the same plan.
-pub(crate) fn in_one_process(rig: &Rig, name: &str, program: &Path, into: &Path) {
-    fs::create_dir_all(into).unwrap();
-    let plan = into.with_extension("json");
-    let path = format!("/home/robot/.local/state/ictus/federations/{name}/plan.json");
-    fs::write(&plan, rig.hosts()[0].exec(&["cat", &path])).unwrap();
-    let output = Command::new("timeout")
-        .args(["--kill-after=5", BOUND_S])
-        .arg(program)
-        .arg("--plan")
-        .arg(&plan)
-        .arg("--trace")
-        .arg(into)
-        .output()
-        .unwrap();
-    assert!(output.status.success(), "{}", said(&output));
-}
-
-/// The static program of an example.
-pub(crate) fn program(name: &str) -> PathBuf {
-    ictus().with_file_name(name)
-}
-
-/// Runs to the end of its time-out, and compares what the hosts wrote with one process.
+/// Runs to the end of its time-out, and has `ictus verify` compare what the hosts wrote with one process.
 pub(crate) fn verify(operator: &Operator<'_>, manifest: &str, name: &str, example: &str) {
     operator.ok(&["logs", "--follow", manifest]);
     for part in operator.parts(manifest) {
         assert_eq!(part["outcome"]["outcome"], "completed", "{part}");
     }
-    let directory = operator.home.path();
-    let (one, many) = (directory.join("one"), directory.join("many"));
-    for old in [&one, &many] {
-        fs::remove_dir_all(old).ok();
-    }
-    gather(operator.rig, name, &many);
-    in_one_process(operator.rig, name, &program(example), &one);
-    let (one, many) = (
-        TraceSet::read(&one).unwrap(),
-        TraceSet::read(&many).unwrap(),
+    let output = operator.run(&["verify", manifest, "--last", "-o", "json"]);
+    assert!(output.status.success(), "{example}: {}", said(&output));
+    let answer: Value = serde_json::from_slice(&output.stdout).unwrap();
+    assert_eq!(answer["federation"], name, "{answer}");
+    assert_eq!(
+        (&answer["equal"], &answer["of"]),
+        (&1.into(), &1.into()),
+        "{answer}"
     );
-    let verdict = compare(&one, &many);
-    assert!(matches!(verdict, Verdict::Equal { .. }), "{verdict:?}");
-    let records = many.records_per_federate();
-    assert!(records.values().all(|count| *count > 0), "{records:?}");
+    let records = answer["records_per_federate"].as_object().unwrap();
+    assert!(
+        records.values().all(|count| count.as_u64() > Some(0)),
+        "{answer}"
+    );
 }
 
 /// The figures of a start.

@@ -1,9 +1,13 @@
-//! `ictusd dial-stdio`: standard input and output become a connection to this user's daemon. What ssh runs.
+//! `ictusd dial-stdio`: standard input and output become a connection to this user's daemon. What ssh runs; with `--viewer`
+//! in `authorized_keys`, for whoever may only look.
 
 use std::io::{self, Read, Write};
 use std::net::Shutdown;
 use std::os::unix::net::UnixStream;
 use std::thread;
+
+use clap::Args;
+use ictusd::paths::viewer_socket;
 
 use crate::error::CliError;
 use crate::session::Session;
@@ -11,12 +15,23 @@ use crate::session::Session;
 /// The line after which the daemon's bytes begin; what a shell prints before it is no answer.
 pub(crate) const MAGIC: &str = "ictus-dial-stdio-1";
 
+/// Connect standard input and output to this user's daemon
+#[derive(Debug, Args)]
+pub(crate) struct DialStdio {
+    /// As whoever may only look
+    #[arg(long)]
+    viewer: bool,
+}
+
 /// Takes no address: it connects to this user's daemon and to nothing else.
-pub(crate) fn run() -> Result<(), CliError> {
+pub(crate) fn run(as_whom: &DialStdio) -> Result<(), CliError> {
     let session = Session::new()?;
     session.block_on(session.daemon())?;
     let socket = session.paths.socket_in_lock();
-    let socket = socket.unwrap_or_else(|| session.paths.socket());
+    let mut socket = socket.unwrap_or_else(|| session.paths.socket());
+    if as_whom.viewer {
+        socket = viewer_socket(&socket);
+    }
     let daemon = UnixStream::connect(&socket).map_err(CliError::failed)?;
     relay(daemon).map_err(CliError::failed)
 }

@@ -17,6 +17,15 @@ use crate::rollout::size;
 use crate::session::Session;
 use crate::ui::Ui;
 
+mod keys;
+
+/// What an upgrade sends and keeps while it is under way.
+const INSTALLED_NEW: &str = ".local/share/ictus/bin/ictusd.new";
+const INSTALLED_OLD: &str = ".local/share/ictus/bin/ictusd.old";
+
+/// Who is let in on a host.
+const AUTHORIZED_KEYS: &str = ".ssh/authorized_keys";
+
 /// The directories that `add` and the daemon make, innermost first.
 const DIRECTORIES: [&str; 5] = [
     ".local/share/ictus/bin",
@@ -39,8 +48,8 @@ enum What {
     Add(Add),
     /// Say what a host can do
     Check(At),
-    /// Put this version there in place of the one that is; what runs goes on
-    Upgrade(At),
+    /// Put this version there in place of the one that is; what runs goes on. One that does not come up is taken back
+    Upgrade(Upgrade),
     /// Remove ictusd and all that it kept; refused while something runs
     Rm(At),
 }
@@ -69,17 +78,23 @@ struct Add {
     fingerprint: Option<String>,
 }
 
+#[derive(Debug, Args)]
+struct Upgrade {
+    #[command(flatten)]
+    at: At,
+    /// Send this program in place of this very one
+    #[arg(long, value_name = "FILE")]
+    program: Option<PathBuf>,
+}
+
 impl Host {
     pub(crate) fn run(&self, ui: &mut Ui) -> Result<(), CliError> {
         let session = Session::new()?;
         session.block_on(async {
             match &self.what {
                 What::Add(add) => add.run(ui, &session).await,
-                What::Check(at) => {
-                    let client = at.daemon(&session).await?;
-                    show(ui, &at.host, &client.host().await?)
-                }
-                What::Upgrade(at) => at.upgrade(ui, &session).await,
+                What::Check(at) => at.check(ui, &session).await,
+                What::Upgrade(upgrade) => upgrade.run(ui, &session).await,
                 What::Rm(at) => at.remove(ui, &session).await,
             }
         })
@@ -100,9 +115,9 @@ impl Add {
         for remark in connection.remarks() {
             ui.message(remark);
         }
-        install(ui, &at.host, &connection).await?;
-        let client = at.daemon(session).await?;
-        show(ui, &at.host, &client.host().await?)
+        let own = std::env::current_exe().map_err(CliError::failed)?;
+        install(ui, &at.host, (&connection, &own, INSTALLED)).await?;
+        at.check(ui, session).await
     }
 
     /// Shows the host's keys and pins the one that is trusted.
@@ -169,15 +184,23 @@ impl At {
         connect(session, &self.host, &way).await
     }
 
-    async fn upgrade(&self, ui: &mut Ui, session: &Session) -> Result<(), CliError> {
+    /// Says what the host can do, and what is dangerous there.
+    async fn check(&self, ui: &mut Ui, session: &Session) -> Result<(), CliError> {
+        let client = self.daemon(session).await?;
+        show(ui, &self.host, &client.host().await?)?;
         let connection = self.open().await;
         let connection = connection.map_err(|error| unreachable_host(&self.host, &error))?;
-        install(ui, &self.host, &connection).await?;
-        // The next one is the new one; it adopts what runs.
-        let client = self.daemon(session).await?;
-        client.give_way().await?;
-        let client = self.daemon(session).await?;
-        show(ui, &self.host, &client.host().await?)
+        // Whoever is let in with a fixed command gets something else than the file, or nothing.
+        let keys = connection.run(&["cat", AUTHORIZED_KEYS], &[]).await;
+        let text = keys.map_or_else(|_| Vec::new(), |output| output.stdout);
+        for key in keys::unrestricted(&String::from_utf8_lossy(&text)) {
+            ui.warning(&format!(
+                "{}: ~/{AUTHORIZED_KEYS}:{}: the key of {} has `command=` without `restrict`: it opens every socket of this user; \
+                 begin the line with `restrict,`",
+                self.host, key.line, key.whose
+            ));
+        }
+        Ok(())
     }
 
     async fn remove(&self, ui: &mut Ui, session: &Session) -> Result<(), CliError> {
@@ -193,10 +216,15 @@ impl At {
             let hint = format!("`ictus down NAME --host {} --purge` removes one", self.host);
             return Err(CliError::failed(message).hint(hint));
         }
+        for name in client.names().await? {
+            client.remove(&name, true).await?;
+        }
         client.end().await?;
         let connection = self.open().await;
         let connection = connection.map_err(|error| unreachable_host(&self.host, &error))?;
-        run(&self.host, &connection, &["rm", "-f", INSTALLED]).await?;
+        for program in [INSTALLED, INSTALLED_NEW, INSTALLED_OLD] {
+            run(&self.host, &connection, &["rm", "-f", program]).await?;
+        }
         for directory in DIRECTORIES {
             // What somebody else put there stays.
             connection.run(&["rmdir", directory], &[]).await.ok();
@@ -206,12 +234,30 @@ impl At {
     }
 }
 
-/// Sends this very program, unless the host's processor is another.
-async fn install(ui: &mut Ui, name: &str, connection: &Connection) -> Result<(), CliError> {
-    let own = std::env::current_exe().map_err(CliError::failed)?;
+impl Upgrade {
+    /// Sends the program beside the one that is there, which then tries it.
+    async fn run(&self, ui: &mut Ui, session: &Session) -> Result<(), CliError> {
+        let at = &self.at;
+        let connection = at.open().await;
+        let connection = connection.map_err(|error| unreachable_host(&at.host, &error))?;
+        let own = std::env::current_exe().map_err(CliError::failed)?;
+        let program = self.program.as_deref().unwrap_or(&own);
+        install(ui, &at.host, (&connection, program, INSTALLED_NEW)).await?;
+        ui.progress("trying", &at.host);
+        run(&at.host, &connection, &[INSTALLED, "swap"]).await?;
+        at.check(ui, session).await
+    }
+}
+
+/// Sends a program, or its like for the host's processor.
+async fn install(
+    ui: &mut Ui,
+    name: &str,
+    (connection, own, to): (&Connection, &Path, &str),
+) -> Result<(), CliError> {
     let said = run(name, connection, &["uname", "-m"]).await?;
     let machine = String::from_utf8_lossy(&said).trim().to_owned();
-    let program = program_for(name, &own, &machine)?;
+    let program = program_for(name, own, &machine)?;
     run(name, connection, &["mkdir", "-p", DIRECTORIES[0]]).await?;
     let whole = std::fs::metadata(&program).map_or(0, |found| found.len());
     let mut told = |sent: u64| {
@@ -220,14 +266,9 @@ async fn install(ui: &mut Ui, name: &str, connection: &Connection) -> Result<(),
             &format!("{name}: {} of {}", size(sent), size(whole)),
         );
     };
-    let sent = connection
-        .upload(&program, INSTALLED, 0o755, &mut told)
-        .await;
+    let sent = connection.upload(&program, to, 0o755, &mut told).await;
     sent.map_err(|error| unreachable_host(name, &error))?;
-    ui.stage(
-        "installed",
-        &format!("{name}: ~/{INSTALLED} ({})", size(whole)),
-    );
+    ui.stage("installed", &format!("{name}: ~/{to} ({})", size(whole)));
     Ok(())
 }
 

@@ -40,9 +40,7 @@ pub(super) fn router() -> Router<Host> {
     let blob = put(write_blob).layer(DefaultBodyLimit::disable());
     let image = put(load_image).layer(DefaultBodyLimit::disable());
     Router::new()
-        .route("/v1/host", get(host_facts))
         .route("/v1/foreign", get(foreign))
-        .route("/v1/leases", get(leases))
         .route("/v1/leases/{name}", lease)
         .route("/v1/images", post(images))
         .route("/v1/images/layers", post(missing_layers))
@@ -51,6 +49,13 @@ pub(super) fn router() -> Router<Host> {
         .route("/v1/blobs/{digest}", blob)
         .route("/v1/federations/{name}/commit", post(commit))
         .route("/v1/federations/{name}/secrets", post(changed_secrets))
+}
+
+/// Those that whoever may look may ask.
+pub(super) fn readable() -> Router<Host> {
+    Router::new()
+        .route("/v1/host", get(host_facts))
+        .route("/v1/leases", get(leases))
 }
 
 #[derive(Deserialize)]

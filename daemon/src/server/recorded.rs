@@ -25,12 +25,13 @@ pub(super) fn readable() -> Router<Host> {
         .route("/v1/names", get(names))
         .route("/v1/federations/{name}/recorded", get(recorded))
         .route("/v1/federations/{name}/recorded/{kind}/{member}", get(file))
-        .route("/v1/federations/{name}/history", get(history))
 }
 
-/// What a generation was run from has the environment of federates in it.
+/// What a generation was run from has the environment of federates in it, and how one ended their words.
 pub(super) fn private() -> Router<Host> {
-    Router::new().route("/v1/federations/{name}/history/{run}", get(generation))
+    Router::new()
+        .route("/v1/federations/{name}/history", get(history))
+        .route("/v1/federations/{name}/history/{run}", get(generation))
 }
 
 async fn names(State(host): State<Host>) -> Json<Vec<String>> {

@@ -1,0 +1,93 @@
+//! `ictusd swap`: what `ictus host upgrade` has the installed program do on its host. It outlives the connection, tries the
+//! program beside it, and takes its own place back when that one does not come up.
+
+use std::path::{Path, PathBuf};
+use std::process::Stdio;
+use std::time::Duration;
+
+use ictusd::client::Client;
+use ictusd::daemon::READY;
+use ictusd::paths::Paths;
+use tokio::io::{AsyncBufReadExt, BufReader};
+
+use crate::error::CliError;
+use crate::session::Session;
+
+/// What an upgrade sends, beside the installed program.
+pub(crate) const NEW: &str = "ictusd.new";
+/// The program before an upgrade, as long as that is under way.
+pub(crate) const OLD: &str = "ictusd.old";
+
+/// How long a new daemon may take to serve.
+const READY_MAX: Duration = Duration::from_secs(30);
+
+/// Why the new program did not take over.
+#[derive(Debug)]
+struct Broken(String);
+
+pub(crate) fn run() -> Result<(), CliError> {
+    // Fails only for a group leader; whoever asked may go away, and this goes on.
+    rustix::process::setsid().ok();
+    let own = std::env::current_exe().map_err(CliError::failed)?;
+    let session = Session::new()?;
+    session.block_on(swap(&session.paths, &own))
+}
+
+async fn swap(paths: &Paths, own: &Path) -> Result<(), CliError> {
+    let beside = |name: &str| -> PathBuf { own.with_file_name(name) };
+    let (new, old) = (beside(NEW), beside(OLD));
+    std::fs::remove_file(&old).ok();
+    std::fs::hard_link(own, &old).map_err(CliError::failed)?;
+    std::fs::rename(&new, own).map_err(CliError::failed)?;
+    let Err(Broken(why)) = take_over(paths, own).await else {
+        return std::fs::remove_file(&old).map_err(CliError::failed);
+    };
+    std::fs::rename(&old, own).map_err(CliError::failed)?;
+    let back = Client::find_or_start(paths, own).await;
+    let then = match back {
+        Ok(_) => "the one before serves again".to_owned(),
+        Err(error) => format!("the one before is back, but does not serve: {error}"),
+    };
+    Err(CliError::failed(format!(
+        "the new ictusd does not come up: {why}; {then}"
+    )))
+}
+
+/// Has the daemon give way, and starts the next one from this program.
+async fn take_over(paths: &Paths, program: &Path) -> Result<(), Broken> {
+    if let Some(client) = Client::find(paths).await {
+        let gone = client.give_way().await;
+        gone.map_err(|error| Broken(error.to_string()))?;
+    }
+    paths.create().map_err(|error| Broken(error.to_string()))?;
+    let log = std::fs::OpenOptions::new()
+        .append(true)
+        .create(true)
+        .open(paths.daemon_log());
+    let log = log.map_err(|error| Broken(error.to_string()))?;
+    let mut command = tokio::process::Command::new(program);
+    command
+        .arg("daemon")
+        .stdin(Stdio::null())
+        .stdout(Stdio::piped())
+        .stderr(log);
+    let mut child = command.spawn().map_err(|error| Broken(error.to_string()))?;
+    let mut line = String::new();
+    let read = async {
+        match child.stdout.take() {
+            Some(out) => BufReader::new(out).read_line(&mut line).await.is_ok(),
+            None => false,
+        }
+    };
+    let answered = tokio::time::timeout(READY_MAX, read).await;
+    if answered.is_ok() && line.trim_end() == READY && Client::find(paths).await.is_some() {
+        return Ok(());
+    }
+    // It may have ended by itself.
+    child.kill().await.ok();
+    let seconds = READY_MAX.as_secs();
+    Err(Broken(match answered {
+        Ok(_) => "it ended, or said something else than that it is ready".to_owned(),
+        Err(_) => format!("it was not ready within {seconds} s"),
+    }))
+}
