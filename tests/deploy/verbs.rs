@@ -6,8 +6,11 @@
     reason = "a test stops at the first surprise"
 )]
 
+use std::fs;
+use std::process::Command;
+
 use ictus_tests::rig::{Rig, Traffic};
-use ictus_tests::said;
+use ictus_tests::{ictus, said};
 use serde_json::Value;
 
 use super::Scenario;
@@ -28,6 +31,11 @@ pub(crate) const SCENARIOS: &[Scenario] = &[
         "a_rollback_brings_back_the_generation_before",
         a_rollback_brings_back_the_generation_before,
     ),
+    (
+        "an_upgrade_that_does_not_come_up_is_rolled_back",
+        an_upgrade_that_does_not_come_up_is_rolled_back,
+    ),
+    ("a_viewer_may_only_look", a_viewer_may_only_look),
 ];
 
 /// What a command prints for programs.
@@ -203,6 +211,115 @@ fn a_rollback_brings_back_the_generation_before(rig: &Rig) {
     operator.ok(&["down", &file]);
     operator.ok(&["rollback", &file, "--to", "3"]);
     assert_eq!(digest(), first);
+    operator.ok(&["down", &file, "--purge"]);
+    operator.leave();
+}
+
+fn an_upgrade_that_does_not_come_up_is_rolled_back(rig: &Rig) {
+    let operator = Operator::with_hosts(rig);
+    let file = operator.manifest("diamond.yaml", &spread(rig, "diamond", &hosts(rig, "")));
+    operator.ok(&["up", &file, "--set", "run=1 h"]);
+    let host = target(&rig.hosts()[0]);
+    let runs = || {
+        let parts = operator.parts(&file);
+        assert!(
+            parts.iter().all(|part| part["state"] == "running"),
+            "{parts:?}"
+        );
+        parts[0]["id"].clone()
+    };
+    let run = runs();
+    // A federate is a static program, too, but no daemon.
+    let broken = ictus().with_file_name("diamond");
+    let broken = broken.to_str().unwrap();
+    let said = operator.fails(&["host", "upgrade", &host, "--program", broken], 1);
+    for words in ["does not come up", "the one before serves again"] {
+        assert!(said.contains(words), "{words}: {said}");
+    }
+    assert_eq!(runs(), run, "the old one has adopted what runs");
+    operator.ok(&["host", "upgrade", &host]);
+    assert_eq!(runs(), run, "and the new one");
+    let left = rig.hosts()[0].exec(&["ls", "/home/robot/.local/share/ictus/bin"]);
+    assert_eq!(left, "ictusd\n");
+    operator.ok(&["down", &file, "--purge"]);
+    operator.leave();
+}
+
+fn a_viewer_may_only_look(rig: &Rig) {
+    let operator = Operator::with_hosts(rig);
+    let file = operator.manifest("diamond.yaml", &spread(rig, "diamond", &hosts(rig, "")));
+    operator.ok(&["up", &file, "--set", "run=1 h"]);
+    // One with a key of its own, which the hosts let in for this command only.
+    let viewer = Operator::new(rig);
+    let ssh = viewer.home.path().join(".ssh");
+    fs::copy(rig.known_hosts(), ssh.join("known_hosts")).unwrap();
+    let key = ssh.join("id_ed25519");
+    fs::remove_file(&key).unwrap();
+    let made = Command::new("ssh-keygen")
+        .args(["-q", "-t", "ed25519", "-N", "", "-C", "viewer", "-f"])
+        .arg(&key)
+        .status();
+    assert!(made.unwrap().success());
+    let public = fs::read_to_string(key.with_extension("pub")).unwrap();
+    let fixed = r#"command="~/.local/share/ictus/bin/ictusd dial-stdio --viewer""#;
+    let admit = |options: &str| {
+        let line = format!("{options} {}", public.trim());
+        let script =
+            r#"cd .ssh && cp -p authorized_keys before && printf '%s\n' "$1" >>authorized_keys"#;
+        for host in rig.hosts() {
+            host.exec_as_robot(&["sh", "-ec", script, "sh", &line]);
+        }
+    };
+    let dismiss = || {
+        for host in rig.hosts() {
+            host.exec_as_robot(&["sh", "-ec", "cd .ssh && mv before authorized_keys"]);
+        }
+    };
+    admit(&format!("restrict,{fixed}"));
+    let host = target(&rig.hosts()[0]);
+    let at = ["diamond", "--host", &host];
+    let looked = viewer.ok(&[&["ps"][..], &at].concat());
+    assert!(looked.contains("diamond on h3"), "{looked}");
+    let events = viewer.ok(&[&["events"][..], &at].concat());
+    assert!(events.contains("h1: healthy"), "{events}");
+    viewer.ok(&[&["timing"][..], &at].concat());
+    for verb in ["logs", "stop", "down"] {
+        let output = viewer.run(&[&[verb][..], &at].concat());
+        let text = said(&output);
+        assert!(!output.status.success(), "{verb}: {text}");
+        assert!(text.contains("may only look"), "{verb}: {text}");
+    }
+    // Nor by ssh itself: the command is what the key stands for, and nothing is forwarded.
+    let asked = Command::new("timeout")
+        .args([
+            "20",
+            "ssh",
+            "-F",
+            "none",
+            "-o",
+            "BatchMode=yes",
+            "-o",
+            "IdentitiesOnly=yes",
+            "-o",
+        ])
+        .arg(format!(
+            "UserKnownHostsFile={}",
+            rig.known_hosts().display()
+        ))
+        .args(["-i", key.to_str().unwrap(), &host, "cat /etc/passwd"])
+        .output()
+        .unwrap();
+    assert!(!said(&asked).contains("robot:"), "{}", said(&asked));
+    let check = operator.ok(&["host", "check", &host]);
+    assert!(!check.contains("without `restrict`"), "{check}");
+    dismiss();
+    admit(fixed);
+    let check = operator.ok(&["host", "check", &host]);
+    assert!(
+        check.contains("the key of viewer has `command=` without `restrict`"),
+        "{check}"
+    );
+    dismiss();
     operator.ok(&["down", &file, "--purge"]);
     operator.leave();
 }

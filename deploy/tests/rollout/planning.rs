@@ -7,7 +7,7 @@ use ictus_deploy::gives::{Denied, Gives};
 use ictus_deploy::placement::{Realtime, RealtimePolicy};
 use ictus_deploy::rollout::{
     Blob, Desired, DesiredHost, Held, MemberState, NewerRecord, Observed, Operation, Plan, Reached,
-    Run, RunState, Stale, plan, plan_down,
+    Run, RunState, Stale, plan, plan_down, plan_stop,
 };
 use ictus_deploy::{Engine, Needs};
 
@@ -577,4 +577,23 @@ plan PLANID__: 8 steps on 2 hosts, 0 B to send",
             .unwrap()
             .is_empty()
     );
+}
+
+#[test]
+fn stopping_ends_what_runs_and_removes_nothing() {
+    let plan = plan_stop("demo", &running(&demo(), "r1"), 35_000).unwrap();
+    assert_eq!(
+        operations(&plan),
+        [
+            "bench lease",
+            "nuc lease",
+            "bench stop_old",
+            "nuc stop_old",
+            "bench release",
+            "nuc release",
+        ]
+    );
+    assert_eq!(plan.steps[2].limit_ms, 35_000);
+    let nothing = plan_stop("demo", &observed(reached()), 1).unwrap();
+    assert!(nothing.is_empty(), "nobody is leased for nothing");
 }
