@@ -13,6 +13,7 @@ use crate::session::Session;
 pub(crate) mod clocks;
 pub(crate) mod copied;
 mod dial;
+pub(crate) mod known;
 pub(crate) mod merge;
 pub(crate) mod outcome;
 

@@ -1,6 +1,7 @@
 //! What this host is and can do.
 
 use std::fs;
+use std::path::{Path, PathBuf};
 
 use ictus_deploy::gives::Gives;
 
@@ -27,13 +28,21 @@ pub(crate) fn of_this_host(paths: &Paths, docker: Result<DockerFacts, String>) -
         state: paths.state.clone(),
         gives: gives(paths),
         docker,
-        starts_at_boot: false,
+        starts_at_boot: starts_at_boot(),
     }
 }
 
 /// What federates may need and it gives.
 pub(crate) fn gives(paths: &Paths) -> Gives {
     gives::of_this_host(paths, &user())
+}
+
+/// Whether systemd has been told to start the user's unit, and to do so while nobody is logged in.
+fn starts_at_boot() -> bool {
+    let wanted = ".config/systemd/user/default.target.wants/ictusd.service";
+    let home = std::env::var_os("HOME").map(PathBuf::from);
+    let enabled = home.is_some_and(|home| fs::symlink_metadata(home.join(wanted)).is_ok());
+    enabled && Path::new("/var/lib/systemd/linger").join(user()).exists()
 }
 
 /// The user's name; its number when there is none.

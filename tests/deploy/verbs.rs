@@ -154,8 +154,8 @@ fn a_saved_plan_is_refused_when_a_host_has_moved_on(rig: &Rig) {
     );
     // The manifest changes: what was planned is not what would be done.
     save("run=2 h");
-    let text = std::fs::read_to_string(&file).unwrap();
-    std::fs::write(&file, text.replace("seed: 1", "seed: 7")).unwrap();
+    let text = fs::read_to_string(&file).unwrap();
+    fs::write(&file, text.replace("seed: 1", "seed: 7")).unwrap();
     let said = operator.fails(&["up", "--plan", plan], 9);
     assert!(said.contains("federate/b/parameters"), "{said}");
     for part in operator.parts(&file) {

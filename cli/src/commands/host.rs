@@ -12,11 +12,13 @@ use ictusd::api::part::HostFacts;
 use ictusd::client::Client;
 
 use crate::error::{CliError, Kind};
+use crate::hosts::known::{self, KnownHost};
 use crate::hosts::{INSTALLED, connect, options, target, unreachable_host};
 use crate::rollout::size;
 use crate::session::Session;
-use crate::ui::Ui;
+use crate::ui::{Table, Ui};
 
+mod boot;
 mod keys;
 
 /// What an upgrade sends and keeps while it is under way.
@@ -46,12 +48,16 @@ pub(crate) struct Host {
 enum What {
     /// Pin the host's key after showing it, put this program there as ictusd, and say what the host can do
     Add(Add),
+    /// List the hosts that were added from here
+    Ls,
     /// Say what a host can do
     Check(At),
     /// Put this version there in place of the one that is; what runs goes on. One that does not come up is taken back
     Upgrade(Upgrade),
     /// Remove ictusd and all that it kept; refused while something runs
     Rm(At),
+    /// Print the systemd unit that `add --at-boot` installs
+    Unit,
 }
 
 #[derive(Debug, Args)]
@@ -76,6 +82,9 @@ struct Add {
     /// Trust the host's key if it has this fingerprint (`SHA256:...`)
     #[arg(long, value_name = "SHA256:...", conflicts_with = "accept_new")]
     fingerprint: Option<String>,
+    /// Have systemd start ictusd there, also while nobody is logged in (a unit of the user's own)
+    #[arg(long)]
+    at_boot: bool,
 }
 
 #[derive(Debug, Args)]
@@ -96,6 +105,8 @@ impl Host {
                 What::Check(at) => at.check(ui, &session).await,
                 What::Upgrade(upgrade) => upgrade.run(ui, &session).await,
                 What::Rm(at) => at.remove(ui, &session).await,
+                What::Ls => list(ui, &session),
+                What::Unit => ui.result(&boot::UNIT, || boot::UNIT.to_owned()),
             }
         })
     }
@@ -117,6 +128,18 @@ impl Add {
         }
         let own = std::env::current_exe().map_err(CliError::failed)?;
         install(ui, &at.host, (&connection, &own, INSTALLED)).await?;
+        if self.at_boot {
+            // The unit's is the one that is to serve.
+            at.daemon(session).await?.give_way().await?;
+            boot::install(ui, &at.host, &connection).await?;
+        }
+        known::change(&session.paths.state, |known| {
+            let host = KnownHost {
+                client: at.client(),
+                identity: at.identity.clone(),
+            };
+            known.insert(at.host.clone(), host);
+        })?;
         at.check(ui, session).await
     }
 
@@ -222,6 +245,7 @@ impl At {
         client.end().await?;
         let connection = self.open().await;
         let connection = connection.map_err(|error| unreachable_host(&self.host, &error))?;
+        boot::remove(&self.host, &connection).await?;
         for program in [INSTALLED, INSTALLED_NEW, INSTALLED_OLD] {
             run(&self.host, &connection, &["rm", "-f", program]).await?;
         }
@@ -229,6 +253,7 @@ impl At {
             // What somebody else put there stays.
             connection.run(&["rmdir", directory], &[]).await.ok();
         }
+        known::change(&session.paths.state, |known| drop(known.remove(&self.host)))?;
         ui.stage("removed", &format!("{}: ictusd", self.host));
         Ok(())
     }
@@ -270,6 +295,30 @@ async fn install(
     sent.map_err(|error| unreachable_host(name, &error))?;
     ui.stage("installed", &format!("{name}: ~/{to} ({})", size(whole)));
     Ok(())
+}
+
+/// The hosts that were added.
+fn list(ui: &mut Ui, session: &Session) -> Result<(), CliError> {
+    let known = known::read(&session.paths.state)?;
+    if known.is_empty() {
+        ui.message("no host; `ictus host add` adds one");
+    }
+    ui.result(&known, || {
+        if known.is_empty() {
+            return String::new();
+        }
+        let mut table = Table::new(&["HOST", "BY", "KEY"]);
+        for (host, at) in &known {
+            let by = match at.client {
+                SshClient::Ssh2 => "ssh2",
+                SshClient::System => "the system's ssh",
+            };
+            let key = at.identity.as_ref().map(|key| key.display().to_string());
+            let key = key.unwrap_or_else(|| "-".to_owned());
+            table.row([host.clone(), by.to_owned(), key]);
+        }
+        table.text()
+    })
 }
 
 /// This program, or that of another processor beside it.

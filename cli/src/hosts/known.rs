@@ -1,0 +1,99 @@
+//! The hosts that this user has added: what `ictus host ls` lists. How they are trusted stands in known_hosts alone.
+
+use std::collections::BTreeMap;
+use std::os::unix::fs::DirBuilderExt;
+use std::path::{Path, PathBuf};
+
+use ictus_deploy::placement::SshClient;
+use serde::{Deserialize, Serialize};
+
+use crate::error::CliError;
+
+/// How an added host is reached, by how it was named.
+pub(crate) type Known = BTreeMap<String, KnownHost>;
+
+/// How an added host is reached.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub(crate) struct KnownHost {
+    pub(crate) client: SshClient,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub(crate) identity: Option<PathBuf>,
+}
+
+/// Reads the list; one that is not there is empty.
+pub(crate) fn read(state: &Path) -> Result<Known, CliError> {
+    let path = file(state);
+    let text = match std::fs::read(&path) {
+        Ok(text) => text,
+        Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(Known::new()),
+        Err(error) => return Err(unusable(&path, &error)),
+    };
+    serde_json::from_slice(&text).map_err(|error| unusable(&path, &error))
+}
+
+/// Changes the list; an empty one leaves no file.
+pub(crate) fn change(state: &Path, change: impl FnOnce(&mut Known)) -> Result<(), CliError> {
+    let path = file(state);
+    let before = read(state)?;
+    let mut known = before.clone();
+    change(&mut known);
+    if known == before {
+        return Ok(());
+    }
+    let failed = |error: std::io::Error| unusable(&path, &error);
+    if known.is_empty() {
+        std::fs::remove_file(&path).map_err(failed)?;
+        // Only when nothing else is there.
+        std::fs::remove_dir(state).ok();
+        return Ok(());
+    }
+    let mut directory = std::fs::DirBuilder::new();
+    directory
+        .recursive(true)
+        .mode(0o700)
+        .create(state)
+        .map_err(failed)?;
+    let mut whole = tempfile::NamedTempFile::new_in(state).map_err(failed)?;
+    serde_json::to_writer_pretty(&mut whole, &known).map_err(|error| unusable(&path, &error))?;
+    whole
+        .persist(&path)
+        .map_err(|error| unusable(&path, &error))?;
+    Ok(())
+}
+
+fn file(state: &Path) -> PathBuf {
+    state.join("hosts.json")
+}
+
+fn unusable(path: &Path, error: &dyn std::fmt::Display) -> CliError {
+    CliError::failed(format!("cannot use {}: {error}", path.display()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_list_is_there_as_long_as_it_has_something() {
+        let directory = tempfile::tempdir().unwrap();
+        let state = directory.path().join("state");
+        let add = |known: &mut Known| {
+            let host = KnownHost {
+                client: SshClient::System,
+                identity: None,
+            };
+            known.insert("ann@nuc".to_owned(), host);
+        };
+        change(&state, |_| {}).unwrap();
+        assert!(!state.exists());
+        change(&state, add).unwrap();
+        change(&state, add).unwrap();
+        assert_eq!(read(&state).unwrap()["ann@nuc"].client, SshClient::System);
+        change(&state, |known| drop(known.remove("ann@nuc"))).unwrap();
+        assert!(!state.exists(), "nothing is left");
+        std::fs::create_dir(&state).unwrap();
+        std::fs::write(file(&state), "no list").unwrap();
+        let error = read(&state).unwrap_err().to_string();
+        assert!(error.contains("hosts.json"), "{error}");
+    }
+}
