@@ -115,6 +115,11 @@ impl Host {
         let name = record.view.name.clone();
         tracing::info!(%name, "its secrets are gone with the host's memory; it waits for `ictus up`");
         record.view.state = State::WaitingForSecrets;
+        // Killed, their supervisors could not remove their sockets; containers' go with them.
+        let members = record.members.values();
+        for member in members.filter(|member| member.container.is_none()) {
+            crate::files::remove(&member.socket).ok();
+        }
         for member in record
             .view
             .federates

@@ -159,6 +159,9 @@ async fn without_its_secrets_a_run_waits_and_is_not_started() {
     world.replace_daemon_after_end().await;
     let view = world.client.federation(NAME).await.unwrap();
     assert_eq!((view.state, view.outcome), (State::WaitingForSecrets, None));
+    let left = fs::read_dir(&world.paths.run).unwrap().flatten();
+    let left: Vec<_> = left.map(|entry| entry.file_name()).collect();
+    assert_eq!(left, ["ictusd.sock"]);
     world.replace_daemon().await;
     let view = world.client.federation(NAME).await.unwrap();
     assert_eq!(view.state, State::WaitingForSecrets);
