@@ -4,6 +4,7 @@ use std::error::Error;
 use std::fmt;
 
 use ictus_deploy::Problems;
+use ictusd::api::ErrorCode;
 use ictusd::client::ClientError;
 use ictusd::paths::PathsError;
 
@@ -142,7 +143,9 @@ impl From<ClientError> for CliError {
         } else {
             None
         };
-        let mut failed = Self::failed(error);
+        let held = error.refusal().is_some_and(|it| it.code == ErrorCode::Held);
+        let kind = if held { Kind::Held } else { Kind::Failed };
+        let mut failed = Self::new(kind, error);
         if !known.is_empty() {
             failed = failed.hint(format!("known: {known}"));
         }

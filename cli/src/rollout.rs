@@ -4,6 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::io;
 use std::net::Ipv4Addr;
 use std::path::{Path, PathBuf};
+use std::time::Duration;
 
 use ictus_deploy::image::elf::Machine;
 use ictus_deploy::placement::{Placement, Way};
@@ -35,8 +36,8 @@ use images::Images;
 use observe::Wanted;
 pub(crate) use saved::SavedPlan;
 
-/// How long an ordered stop of a federation may take of which no manifest says more, in milliseconds.
-const STOP_LIMIT_MS: u64 = 60_000;
+/// How long an ordered stop of a federation may take at least, of which no manifest says more.
+const STOP_LIMIT_MIN: Duration = Duration::from_secs(60);
 
 /// A checked manifest with hosts, and what they said.
 #[derive(Debug)]
@@ -210,15 +211,20 @@ async fn next_generation(clients: &Clients, federation: &str) -> u64 {
     all.map(|run| run.number).max().unwrap_or(0) + 1
 }
 
+fn stop_limit_ms(limit: Duration) -> u64 {
+    u64::try_from(limit.max(STOP_LIMIT_MIN).as_millis()).unwrap_or(u64::MAX)
+}
+
 /// What is planned to stop a federation, and on whom it is carried out.
 pub(crate) async fn stop(
     session: &Session,
     name: &str,
     ways: &BTreeMap<String, Way>,
+    limit: Duration,
 ) -> Result<(Clients, Plan), CliError> {
     let connected = connect_all(session, ways).await;
     let (clients, observed) = observe::all(connected, name, &|_| Wanted::default()).await;
-    let plan = plan_stop(name, &observed, STOP_LIMIT_MS).map_err(refused)?;
+    let plan = plan_stop(name, &observed, stop_limit_ms(limit)).map_err(refused)?;
     Ok((clients, plan))
 }
 
@@ -227,11 +233,11 @@ pub(crate) async fn down(
     session: &Session,
     name: &str,
     ways: &BTreeMap<String, Way>,
-    purge: bool,
+    (purge, limit): (bool, Duration),
 ) -> Result<(Clients, Plan), CliError> {
     let connected = connect_all(session, ways).await;
     let (clients, observed) = observe::all(connected, name, &|_| Wanted::default()).await;
-    let plan = plan_down(name, &observed, purge, STOP_LIMIT_MS).map_err(refused)?;
+    let plan = plan_down(name, &observed, purge, stop_limit_ms(limit)).map_err(refused)?;
     Ok((clients, plan))
 }
 

@@ -189,10 +189,34 @@ impl Whereabouts {
         if found.is_empty() {
             found = left(&clients, &name).await;
         }
+        if found.values().any(|way| *way == Way::Local) {
+            check_here(session, &clients, &name).await?;
+        }
         // One that is whole on its host has no record of others.
         let ways = if found.is_empty() { given_ways } else { found };
         Ok(Abroad { name, ways })
     }
+}
+
+/// A record that speaks of "this machine" means the one from which it was deployed: that must be this one.
+async fn check_here(session: &Session, clients: &[Client], name: &str) -> Result<(), CliError> {
+    let runs = async |client: &Client| -> BTreeSet<String> {
+        let running = client.federation(name).await.ok().map(|view| view.id);
+        let ended = client.history(name).await.unwrap_or_default();
+        running
+            .into_iter()
+            .chain(ended.into_iter().map(|run| run.id))
+            .collect()
+    };
+    let here = runs(&session.daemon().await?).await;
+    for client in clients {
+        if !runs(client).await.is_disjoint(&here) {
+            return Ok(());
+        }
+    }
+    let message =
+        format!("federation `{name}` has a part on the machine from which it was started");
+    Err(CliError::failed(message).hint("that is not this one: give the command there"))
 }
 
 /// A manifest as far as it can be known without building.

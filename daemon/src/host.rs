@@ -308,7 +308,15 @@ impl Host {
         }
         self.check_driven(name)?;
         self.listeners().release(name);
+        let seen = self.view(name).ok().map(|view| view.id);
+        self.check_fence(name, fence)?;
         self.remove_containers(name, Images::Remove).await?;
+        // Whoever has taken over meanwhile may have begun another run.
+        self.check_fence(name, fence)?;
+        if self.handle(name).is_some() || self.view(name).ok().map(|view| view.id) != seen {
+            let what = format!("federation `{name}` was begun again by somebody else meanwhile");
+            return Err(error(ErrorCode::Conflict, what));
+        }
         self.settle(name);
         self.remove_secrets(name)?;
         let kept = self

@@ -170,19 +170,33 @@ async fn stop(
     host.check_fence(&name, query.fence)?;
     let told = host.subscribe();
     let (lines, body) = JsonLines::new(None);
-    let Some(handle) = host.handle(&name) else {
-        // It has ended already: its end is all there is to tell.
-        let view = host.view(&name)?;
-        if let Some(outcome) = view.outcome {
-            let event = Event::Ended { outcome };
-            lines
-                .send(&Happening {
-                    at_ns: view.since_ns,
-                    federation: name,
-                    event,
-                })
-                .await;
+    let handle = host.handle(&name);
+    let view = match &handle {
+        Some(handle) => handle.view.borrow().clone(),
+        None => host.view(&name)?,
+    };
+    if let Some(outcome) = view.outcome {
+        // It has ended already (what it made may still be removed): its end is all there is to tell.
+        let event = Event::Ended { outcome };
+        let at_ns = view.since_ns;
+        let federation = name;
+        lines
+            .send(&Happening {
+                at_ns,
+                federation,
+                event,
+            })
+            .await;
+        if let Some(mut handle) = handle {
+            // The stream ends when nothing is left to be removed.
+            tokio::spawn(async move {
+                while handle.view.changed().await.is_ok() {}
+                drop(lines);
+            });
         }
+        return Ok(stream(body));
+    }
+    let Some(handle) = handle else {
         return Ok(stream(body));
     };
     let command = if query.kill {

@@ -69,10 +69,11 @@ impl Down {
     ) -> Result<(), CliError> {
         let mut interrupts = Interrupts::new()?;
         let at = (abroad.name.as_str(), &abroad.ways);
-        let planned = match rollout::down(session, at.0, at.1, self.purge).await {
+        let how = (self.purge, self.timeout);
+        let planned = match rollout::down(session, at.0, at.1, how).await {
             Err(refusal) if refusal.kind == Kind::Held => {
                 patience::outlive(ui, session, at, &mut interrupts, refusal).await?;
-                rollout::down(session, at.0, at.1, self.purge).await
+                rollout::down(session, at.0, at.1, how).await
             }
             planned => planned,
         };

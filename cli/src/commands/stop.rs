@@ -57,7 +57,7 @@ impl Stop {
     ) -> Result<(), CliError> {
         let mut interrupts = Interrupts::new()?;
         let name = &abroad.name;
-        let (clients, plan) = rollout::stop(session, name, &abroad.ways).await?;
+        let (clients, plan) = rollout::stop(session, name, &abroad.ways, self.timeout).await?;
         if plan.is_empty() {
             ui.message(&format!("{name}: nothing of it runs"));
         } else {

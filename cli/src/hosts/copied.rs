@@ -2,16 +2,21 @@
 
 use std::collections::BTreeMap;
 use std::fs::{File, OpenOptions};
+use std::io::{self, Write};
 use std::path::PathBuf;
 
 use ictus_coord::plan::Plan;
 use ictus_deploy::TimingSpec;
 use ictusd::api::recorded::{FileKind, Recorded};
 use ictusd::client::Client;
+use ictusd::store;
 use tempfile::TempDir;
 
 use super::Clients;
 use crate::error::CliError;
+
+/// Bytes that a federate may have written between being measured and being copied.
+const WRITTEN_SINCE_MAX: u64 = 256 << 20;
 
 /// What the hosts have written of a federation's last run, as far as it was copied; removed with this.
 #[derive(Debug)]
@@ -59,6 +64,12 @@ impl Copied {
             let recorded = client.recorded(&self.federation).await?;
             self.plan = recorded.plan.clone();
             for (federate, bytes) in of_kind(recorded, kind) {
+                // A name becomes a path here; a host is not trusted with those.
+                if !store::is_name(&federate) {
+                    let message =
+                        format!("a host speaks of a federate `{federate}`, which is no name");
+                    return Err(CliError::failed(message));
+                }
                 self.copy(client, (kind, federate), bytes).await?;
             }
         }
@@ -82,12 +93,40 @@ impl Copied {
             (file, here)
         };
         let mut file = file.map_err(CliError::failed)?;
+        // A member may have written a little more since.
+        let bytes = bytes.saturating_add(WRITTEN_SINCE_MAX);
         let part = (*kind, federate.as_str(), from);
+        let mut file = Announced {
+            file: &mut file,
+            left: bytes.saturating_sub(from),
+        };
         let copied = client
             .copy_recorded(&self.federation, part, &mut file)
             .await?;
         self.here.insert(key, from + copied);
         Ok(())
+    }
+}
+
+/// A file that takes no more than was announced.
+struct Announced<'f> {
+    file: &'f mut File,
+    left: u64,
+}
+
+impl Write for Announced<'_> {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        let taken = u64::try_from(bytes.len()).unwrap_or(u64::MAX);
+        if taken > self.left {
+            return Err(io::Error::other("the host sends more than it has said"));
+        }
+        self.left -= taken;
+        self.file.write_all(bytes)?;
+        Ok(bytes.len())
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        self.file.flush()
     }
 }
 

@@ -106,8 +106,17 @@ impl Host {
         match tokio::time::timeout(GREETING_MAX, greeting).await {
             Ok(Ok(())) => Ok(Box::new(channel)),
             Ok(Err(error)) if error.kind() == io::ErrorKind::UnexpectedEof => {
-                let what =
+                let complaint = tokio::time::timeout(GREETING_MAX, channel.complaint()).await;
+                let complaint = complaint.unwrap_or_default();
+                let mut what =
                     format!("no ictusd answers there; `ictus host add` puts it at ~/{INSTALLED}");
+                let said = complaint
+                    .lines()
+                    .find_map(|line| line.strip_prefix("error: "));
+                if let Some(line) = said.or_else(|| complaint.lines().last()) {
+                    let line: String = line.chars().filter(|it| !it.is_control()).collect();
+                    what = format!("{line} ({what})");
+                }
                 Err(io::Error::new(io::ErrorKind::NotFound, what))
             }
             Ok(Err(error)) => Err(error),

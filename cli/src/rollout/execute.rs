@@ -10,7 +10,7 @@ use std::time::{Duration, Instant};
 use ictus_deploy::rollout::{Apply, Moment, Operation, Outcome, Phase, Step, StepId};
 use ictusd::api::part::{CommitRequest, LeaseRequest, PrepareRequest};
 use ictusd::api::recorded::Kept;
-use ictusd::api::{self, ErrorCode, Event, Happening, Removed};
+use ictusd::api::{self, ErrorCode, Event, Happening, Removed, State};
 use ictusd::client::{Client, ClientError, Stream};
 use ictusd::{identity, stamp};
 use tokio::task::JoinSet;
@@ -406,12 +406,17 @@ impl Executor {
         }
     }
 
-    /// A part has ended before it was healthy, or nobody knows how it is.
+    /// A part has ended before all were healthy, or nobody knows how it is.
     fn part_failed(&mut self, host: &str, outcome: Outcome) {
         let listening = self.listening.take_if(|(at, _)| at == host);
         let step = listening.map(|(_, step)| step);
         if let Some(step) = step.or_else(|| self.healthy.remove(host)) {
             self.apply.handle_done(self.now(), step, outcome);
+        } else if outcome == Outcome::Done {
+            // It has come to its end already: nothing is to be waited for.
+            self.heard_healthy.insert(host.to_owned());
+        } else {
+            self.apply.handle_lost(self.now(), host, outcome);
         }
     }
 
@@ -464,7 +469,11 @@ impl Executor {
                 commit,
                 kept: self.kept,
             }),
-            Phase::Undone { cause, old_stopped } => {
+            Phase::Undone {
+                cause,
+                old_stopped,
+                held,
+            } => {
                 let left = if *old_stopped {
                     "; the run that was there has been stopped"
                 } else {
@@ -473,6 +482,9 @@ impl Executor {
                 let what = cause
                     .as_ref()
                     .map_or_else(|| "interrupted".to_owned(), ToString::to_string);
+                if *held {
+                    return Err(CliError::new(Kind::Held, what));
+                }
                 Err(CliError::failed(format!("{what}{left}")))
             }
             Phase::Failed { cause, left } => {
@@ -547,6 +559,11 @@ impl Call {
                 Ok((Outcome::Done, Effect::Sent(sent)))
             }
             Operation::SendImage { image, .. } => self.send_image(image).await,
+            Operation::StopPart { run } if self.is_prepared(run).await? => {
+                // Nothing of it was begun: nothing of it is to stay.
+                left(client.undo_part(key).await)?;
+                done
+            }
             Operation::StopOld { run } | Operation::StopPart { run } => {
                 if self.is_there(run).await? {
                     let mut stream = client.stop_part(key, self.kill).await?;
@@ -588,6 +605,11 @@ impl Call {
             }
             Operation::AwaitHealthy => done,
         }
+    }
+
+    async fn is_prepared(&self, run: &str) -> Result<bool, ClientError> {
+        let view = view(&self.client, &self.federation).await?;
+        Ok(view.is_some_and(|view| view.id == run && view.state == State::Prepared))
     }
 
     async fn is_there(&self, run: &str) -> Result<bool, ClientError> {

@@ -91,10 +91,11 @@ pub(super) async fn take_down(
     purge: bool,
 ) -> Result<(), CliError> {
     let mut interrupts = Interrupts::new()?;
-    let (clients, plan) = rollout::down(session, &abroad.name, &abroad.ways, purge).await?;
+    let limit = super::SLACK;
+    let how = (purge, limit);
+    let (clients, plan) = rollout::down(session, &abroad.name, &abroad.ways, how).await?;
     if !plan.is_empty() {
         let executor = Executor::down(clients, plan)?;
-        let limit = super::SLACK;
         executor
             .run(&mut Ui::silent(), &mut interrupts, limit)
             .await?;

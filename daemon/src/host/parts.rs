@@ -226,10 +226,12 @@ impl Host {
             .read_request()
             .ok()
             .and_then(|request| request.part);
+        let record = recorded(name, &directory).map_err(|error| store_error(&error))?;
+        // A start that was undone has left no request.
+        let part = part.or_else(|| record.as_ref().and_then(|record| record.view.part.clone()));
         if part.is_none_or(|part| part.engine != Engine::Docker) {
             return Ok(());
         }
-        let record = recorded(name, &directory).map_err(|error| store_error(&error))?;
         container::sweep(name, record.as_ref(), images)
             .await
             .map_err(|error| error_of(format!("federation `{name}` leaves containers: {error}")))

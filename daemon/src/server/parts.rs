@@ -28,6 +28,9 @@ use crate::host::Host;
 
 use super::{JsonLines, StarterGuard, bad_request, pass_until_end, stream};
 
+/// How long the engine may take to say what it is, before a host is told without it.
+const ENGINE_MAX: Duration = Duration::from_secs(4);
+
 /// Pieces of a blob that wait for the disk.
 const PIECES_MAX: usize = 16;
 /// How long giving images up may take.
@@ -77,10 +80,16 @@ struct BlobQuery {
 }
 
 async fn host_facts(State(host): State<Host>) -> Json<HostFacts> {
-    let docker = Engine::connect().await;
-    let docker = docker
-        .map(|engine| engine.facts().clone())
-        .map_err(|error| error.to_string());
+    // An engine that hangs concerns only those who need one.
+    let docker = match timeout(ENGINE_MAX, Engine::connect()).await {
+        Ok(connected) => connected
+            .map(|engine| engine.facts().clone())
+            .map_err(|error| error.to_string()),
+        Err(_) => Err(format!(
+            "the Docker engine does not answer within {} s",
+            ENGINE_MAX.as_secs()
+        )),
+    };
     Json(facts::of_this_host(host.paths(), docker))
 }
 

@@ -9,6 +9,7 @@ use axum::extract::{Path, Query, State};
 use axum::http::header::{CONTENT_LENGTH, CONTENT_TYPE};
 use axum::response::{IntoResponse, Json, Response};
 use axum::routing::get;
+use rustix::fs::{Mode, OFlags};
 use serde::Deserialize;
 
 use super::{JsonLines, Sender};
@@ -96,8 +97,14 @@ async fn file(
 }
 
 fn open(path: &std::path::Path, from: u64) -> io::Result<(File, u64)> {
-    let mut file = File::open(path)?;
-    let length = file.metadata()?.len();
+    // Federates write there: what they put in its place (a link, a pipe) is not followed and not waited for.
+    let flags = OFlags::RDONLY | OFlags::NOFOLLOW | OFlags::NONBLOCK | OFlags::CLOEXEC;
+    let mut file = File::from(rustix::fs::open(path, flags, Mode::empty())?);
+    let metadata = file.metadata()?;
+    if !metadata.is_file() {
+        return Err(io::Error::other("it is no file"));
+    }
+    let length = metadata.len();
     file.seek(SeekFrom::Start(from))?;
     Ok((file, length.saturating_sub(from)))
 }

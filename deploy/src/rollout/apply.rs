@@ -69,12 +69,14 @@ pub enum Phase {
         cause: Option<Cause>,
         /// Whether the run that was there has been stopped for it.
         old_stopped: bool,
+        /// Whether nothing was begun because somebody else holds a lease.
+        held: bool,
     },
     /// It was started and has been stopped, or something could not be undone.
     Failed {
         /// The first cause; absent after an interrupt.
         cause: Option<Cause>,
-        /// Hosts on which something of the new run may be left.
+        /// Hosts on which something of the new run may be left, or that were to be cleared and were not.
         left: BTreeSet<String>,
     },
     /// Somebody else took over: nothing more was done and nothing undone.
@@ -113,6 +115,7 @@ pub struct Apply {
     tasks: Vec<Task>,
     causes: Vec<Cause>,
     interrupted: bool,
+    held: bool,
 }
 
 /// A step and how far it is.
@@ -158,6 +161,7 @@ impl Apply {
             phase: Phase::Leasing,
             causes: Vec::new(),
             interrupted: false,
+            held: false,
         };
         apply.conclude();
         apply
@@ -240,10 +244,32 @@ impl Apply {
             }
             Outcome::Held { what } if operation == Operation::Lease => {
                 task.state = State::Failed;
+                self.held = true;
                 self.fail(now, &host, &operation, (0, now.wall_ns, what));
             }
             Outcome::Held { what } => self.handle_fenced(host, what),
         }
+        self.conclude();
+    }
+
+    /// A part failed, or is out of sight, although nobody waits for its health at this time: the others are not waited for
+    /// either, and this is among the causes. Once every part is healthy it changes nothing.
+    pub fn handle_lost(&mut self, now: Moment, host: &str, outcome: Outcome) {
+        let Outcome::Failed { what, rank, at_ns } = outcome else {
+            return;
+        };
+        let during = matches!(self.phase, Phase::Committing | Phase::Stopping);
+        if !during || self.healthy() {
+            return;
+        }
+        for task in &mut self.tasks {
+            let awaits = task.step.operation == Operation::AwaitHealthy && task.step.host == host;
+            if awaits && !task.state.settled() {
+                task.state = State::Failed;
+            }
+        }
+        let at_ns = at_ns.unwrap_or(now.wall_ns);
+        self.fail(now, host, &Operation::AwaitHealthy, (rank, at_ns, what));
         self.conclude();
     }
 
@@ -491,9 +517,11 @@ impl Apply {
         self.phase = match self.phase {
             Phase::Undoing if left.is_empty() => Phase::Undone {
                 cause,
-                old_stopped: !self
-                    .begun(|operation| matches!(operation, Operation::StopOld { .. }))
-                    .is_empty(),
+                old_stopped: self.tasks.iter().any(|task| {
+                    matches!(task.step.operation, Operation::StopOld { .. })
+                        && task.state == State::Done
+                }),
+                held: self.held,
             },
             Phase::Undoing | Phase::Stopping => Phase::Failed { cause, left },
             Phase::Leasing
@@ -506,16 +534,21 @@ impl Apply {
         };
     }
 
-    /// Where undoing or stopping was not confirmed.
+    /// Where undoing or stopping was not confirmed, and, when nothing new was to run, what was begun to be taken down.
     fn left(&self) -> BTreeSet<String> {
+        let mut kinds = self.tasks.iter().map(|task| &task.step.operation);
+        let starts = kinds.any(|operation| matches!(operation, Operation::Prepare { .. }));
+        let ends = !starts
+            && !self
+                .begun(|it| matches!(it, Operation::StopOld { .. } | Operation::RemoveOld { .. }))
+                .is_empty();
         let left = self.tasks.iter().filter(|task| {
             let undoes = match task.step.operation {
                 Operation::RemovePart { .. } | Operation::StopPart { .. } => true,
+                Operation::StopOld { .. } | Operation::RemoveOld { .. } => ends,
                 Operation::Lease
                 | Operation::SendBlob { .. }
                 | Operation::SendImage { .. }
-                | Operation::StopOld { .. }
-                | Operation::RemoveOld { .. }
                 | Operation::Prepare { .. }
                 | Operation::CommitRti
                 | Operation::Commit

@@ -58,6 +58,14 @@ impl Channel {
         Self(Inner::System(Box::new(process)))
     }
 
+    /// What the command wrote to its standard error, once its output has ended; the caller bounds the wait. Empty when
+    /// the connection is lost.
+    pub async fn complaint(&mut self) -> String {
+        let end = self.end().await;
+        let stderr = end.map_or_else(|_| Vec::new(), |end| end.stderr);
+        String::from_utf8_lossy(&stderr).trim().to_owned()
+    }
+
     /// Waits for the command's end, after its output was read. The caller bounds it.
     pub(super) async fn end(&mut self) -> Result<End, SshError> {
         match &mut self.0 {

@@ -3,7 +3,7 @@
 use std::collections::BTreeSet;
 use std::time::Duration;
 
-use ictus_deploy::rollout::{Apply, Moment, Operation, Outcome, Phase, Step, plan};
+use ictus_deploy::rollout::{Apply, Moment, Operation, Outcome, Phase, Step, plan, plan_down};
 
 use super::planning::{demo, running};
 
@@ -128,7 +128,10 @@ fn what_fails_before_the_commit_is_undone_wherever_it_was_asked() {
     for step in &releases {
         done(&mut apply, step);
     }
-    let Phase::Undone { cause, old_stopped } = apply.phase().clone() else {
+    let Phase::Undone {
+        cause, old_stopped, ..
+    } = apply.phase().clone()
+    else {
         panic!("{:?}", apply.phase());
     };
     assert_eq!(
@@ -198,7 +201,10 @@ fn a_host_that_moved_on_is_not_touched() {
     let releases = steps(&mut apply, at(0));
     assert_eq!(words(&releases), ["bench release"]);
     done(&mut apply, &releases[0]);
-    let Phase::Undone { cause, old_stopped } = apply.phase().clone() else {
+    let Phase::Undone {
+        cause, old_stopped, ..
+    } = apply.phase().clone()
+    else {
         panic!("{:?}", apply.phase());
     };
     assert_eq!(
@@ -226,6 +232,7 @@ fn of_two_who_want_the_leases_one_gets_all() {
         apply.phase(),
         Phase::Undone {
             old_stopped: false,
+            held: true,
             ..
         }
     ));
@@ -310,4 +317,59 @@ fn late_and_foreign_answers_are_not_heard() {
         (apply.phase(), steps(&mut apply.clone(), at(0)).len()),
         (&before, 0)
     );
+}
+
+/// The RTI's host starts its federates at once: one that ends before the others were even asked to begin is the cause.
+#[test]
+fn a_part_that_ends_while_others_begin_is_the_first_cause() {
+    let mut apply = apply();
+    let rti = until(&mut apply, "commit_rti");
+    done(&mut apply, &rti[0]);
+    let commit = steps(&mut apply, at(0));
+    assert_eq!(words(&commit), ["nuc commit"]);
+    apply.handle_lost(at(1), "bench", failed("`a` exited with 1", 0, 5));
+    assert_eq!(*apply.phase(), Phase::Stopping);
+    // What comes later is a consequence.
+    apply.handle_done(at(2), commit[0].id, failed("not joined in time", 0, 9));
+    let stops = steps(&mut apply, at(2));
+    assert_eq!(words(&stops), ["bench stop_part", "nuc stop_part"]);
+    for step in &stops {
+        done(&mut apply, step);
+    }
+    for step in &steps(&mut apply, at(2)) {
+        done(&mut apply, step);
+    }
+    let Phase::Failed { cause, left } = apply.phase().clone() else {
+        panic!("{:?}", apply.phase());
+    };
+    assert!(cause.unwrap().what.contains("`a` exited with 1"));
+    assert!(left.is_empty());
+}
+
+#[test]
+fn who_is_healthy_with_all_others_is_lost_to_nobody() {
+    let mut apply = apply();
+    for step in &until(&mut apply, "await_healthy") {
+        done(&mut apply, step);
+    }
+    apply.handle_lost(at(1), "bench", failed("the connection was lost", 0, 5));
+    assert_eq!(*apply.phase(), Phase::Committing);
+}
+
+#[test]
+fn what_is_taken_down_on_some_hosts_only_is_said_so() {
+    let observed = running(&demo(), "r1");
+    let plan = plan_down("demo", &observed, true, 60_000).unwrap();
+    let mut apply = Apply::new(plan, "r2".to_owned());
+    let removals = until(&mut apply, "remove_old");
+    assert_eq!(words(&removals), ["bench remove_old", "nuc remove_old"]);
+    done(&mut apply, &removals[0]);
+    apply.handle_done(at(1), removals[1].id, failed("it is busy", 0, 5));
+    for step in &steps(&mut apply, at(1)) {
+        done(&mut apply, step);
+    }
+    let Phase::Failed { left, .. } = apply.phase().clone() else {
+        panic!("{:?}", apply.phase());
+    };
+    assert_eq!(left, BTreeSet::from(["nuc".to_owned()]));
 }
