@@ -237,6 +237,7 @@ mod tests {
             address: HERE,
             engine: Engine::Process,
             ports,
+            security: ictus_deploy::placement::Security::TrustedNetwork,
             programs: BTreeMap::new(),
         };
         let request = StartRequest {

@@ -119,6 +119,7 @@ impl Rig {
             address,
             engine: Engine::Docker,
             ports: None,
+            security: ictus_deploy::placement::Security::TrustedNetwork,
             programs: BTreeMap::new(),
         });
         request

@@ -209,7 +209,8 @@ async fn keys_are_in_files_of_their_members_and_nowhere_else() {
         }
     }
     found.sort();
-    let expected = ["a", "rti"].map(|member| format!("{NAME}/tls/{member}/key.pem").into());
+    let expected = ["a", "rti"].map(|member| format!("{NAME}/tls/{member}/key.pem"));
+    let expected = expected.map(std::path::PathBuf::from);
     assert_eq!(found, expected);
     world
         .client

@@ -143,6 +143,7 @@ mod tests {
             hosts: (1..).zip(["h1", "h2", "h3"]).map(host).collect(),
             rti: 0,
             federates: vec![0, 1, 2],
+            security: placement::Security::default(),
         }
     }
 

@@ -30,8 +30,10 @@ pub(super) async fn install(
     let mut file = tempfile::NamedTempFile::new().map_err(CliError::failed)?;
     file.write_all(UNIT.as_bytes()).map_err(CliError::failed)?;
     run(host, connection, &["mkdir", "-p", DIRECTORY]).await?;
-    let sent = connection.upload(file.path(), PATH, 0o644, &mut |_| {});
-    sent.await.map_err(|error| unreachable_host(host, &error))?;
+    let sent = connection
+        .upload(file.path(), PATH, 0o644, &mut |_| {})
+        .await;
+    sent.map_err(|error| unreachable_host(host, &error))?;
     let linger = connection.run(&["loginctl", "enable-linger"], &[]).await;
     if !linger.is_ok_and(|output| output.code == 0) {
         ui.warning(&format!(
