@@ -67,7 +67,6 @@ fn down_without_purge_leaves_the_last_logs_and_names_them() {
 }
 
 #[test]
-#[expect(clippy::print_stderr, reason = "a test's report")]
 fn a_realtime_federate_keeps_its_memory_and_its_secret() {
     let sandbox = Sandbox::new();
     let token = sandbox.state().join("token");

@@ -1,6 +1,10 @@
 //! Federations under TLS, on this machine: the real RTI and real federates, with certificates made as `ictus up` makes them.
 
-#![expect(clippy::unwrap_used, reason = "a test stops at the first surprise")]
+#![expect(
+    clippy::unwrap_used,
+    clippy::panic,
+    reason = "a test stops at the first surprise"
+)]
 
 use ictus_deploy::trace::{TraceSet, Verdict, compare};
 use ictus_stream::{Authority, Member};

@@ -72,7 +72,7 @@ fn merge(by_host: &BTreeMap<String, Vec<GenerationView>>) -> Vec<Entry> {
         })
     };
     let mut entries: Vec<Entry> = runs.into_iter().filter_map(entry).collect();
-    entries.sort_by(|one, other| (other.number, other.at_ns).cmp(&(one.number, one.at_ns)));
+    entries.sort_by_key(|entry| std::cmp::Reverse((entry.number, entry.at_ns)));
     entries
 }
 

@@ -77,9 +77,10 @@ async fn file(
     let (file, length) = opened
         .unwrap_or_else(|error| Err(io::Error::other(error)))
         .map_err(|error| ApiError {
-            code: match error.kind() {
-                io::ErrorKind::NotFound => ErrorCode::Unknown,
-                _ => ErrorCode::Failed,
+            code: if error.kind() == io::ErrorKind::NotFound {
+                ErrorCode::Unknown
+            } else {
+                ErrorCode::Failed
             },
             message: format!(
                 "federate `{member}` of `{name}` has no {} file here: {error}",

@@ -178,7 +178,7 @@ proptest! {
     ) {
         prop_assume!(steps.is_empty() || steps.iter().any(|step| *step > 0));
         let (mut near, mut far) = pair(pipes(&steps, capacity));
-        let text: Vec<u8> = (0..length).map(|at| (at % 251) as u8).collect();
+        let text: Vec<u8> = (0..=250).cycle().take(length).collect();
         prop_assert!(send(&mut near, &mut far, &text) == text);
         prop_assert_eq!(far.peer(), Some(Member::Federate(3)));
         prop_assert_eq!(near.peer(), Some(Member::Rti));
