@@ -8,6 +8,7 @@
 
 use std::fs;
 use std::os::unix::fs::PermissionsExt;
+use std::path::PathBuf;
 use std::process::{Command, Output, Stdio};
 use std::time::Instant;
 
@@ -154,6 +155,11 @@ pub(crate) fn spread(rig: &Rig, example: &str, head: &str) -> String {
     }
     assert!(turn >= rig.hosts().len(), "{spread}");
     spread
+}
+
+/// The static program of an example.
+pub(crate) fn program(name: &str) -> PathBuf {
+    ictus().with_file_name(name)
 }
 
 /// Runs to the end of its time-out, and has `ictus verify` compare what the hosts wrote with one process.

@@ -1,10 +1,6 @@
 //! What protects the messages between hosts.
 
-#![expect(
-    clippy::unwrap_used,
-    clippy::panic,
-    reason = "a test stops at the first surprise"
-)]
+#![expect(clippy::panic, reason = "a test stops at the first surprise")]
 
 use ictus_tests::rig::Rig;
 

@@ -7,7 +7,8 @@
 )]
 
 use std::fs;
-use std::process::Command;
+use std::path::Path;
+use std::process::{Command, Output};
 
 use ictus_tests::rig::{Rig, Traffic};
 use ictus_tests::{ictus, said};
@@ -245,6 +246,26 @@ fn an_upgrade_that_does_not_come_up_is_rolled_back(rig: &Rig) {
     operator.leave();
 }
 
+/// What ssh says to somebody with this key who asks for a file.
+fn reads_by_ssh(rig: &Rig, key: &Path, host: &str) -> Output {
+    let options = [
+        "-F",
+        "none",
+        "-o",
+        "BatchMode=yes",
+        "-o",
+        "IdentitiesOnly=yes",
+    ];
+    let known = format!("UserKnownHostsFile={}", rig.known_hosts().display());
+    Command::new("timeout")
+        .args(["20", "ssh"])
+        .args(options)
+        .args(["-o", &known, "-i", key.to_str().unwrap()])
+        .args([host, "cat /etc/passwd"])
+        .output()
+        .unwrap()
+}
+
 fn a_viewer_may_only_look(rig: &Rig) {
     let operator = Operator::with_hosts(rig);
     let file = operator.manifest("diamond.yaml", &spread(rig, "diamond", &hosts(rig, "")));
@@ -290,25 +311,7 @@ fn a_viewer_may_only_look(rig: &Rig) {
         assert!(text.contains("may only look"), "{verb}: {text}");
     }
     // Nor by ssh itself: the command is what the key stands for, and nothing is forwarded.
-    let asked = Command::new("timeout")
-        .args([
-            "20",
-            "ssh",
-            "-F",
-            "none",
-            "-o",
-            "BatchMode=yes",
-            "-o",
-            "IdentitiesOnly=yes",
-            "-o",
-        ])
-        .arg(format!(
-            "UserKnownHostsFile={}",
-            rig.known_hosts().display()
-        ))
-        .args(["-i", key.to_str().unwrap(), &host, "cat /etc/passwd"])
-        .output()
-        .unwrap();
+    let asked = reads_by_ssh(rig, &key, &host);
     assert!(!said(&asked).contains("robot:"), "{}", said(&asked));
     let check = operator.ok(&["host", "check", &host]);
     assert!(!check.contains("without `restrict`"), "{check}");
