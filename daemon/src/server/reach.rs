@@ -1,13 +1,17 @@
 //! The routes that try whether hosts can connect; see [`crate::api::reach`].
 
 use axum::Router;
+use axum::body::Bytes;
 use axum::response::Json;
 use axum::routing::post;
+use serde::de::DeserializeOwned;
 
 use crate::api::reach::{ListenRequest, Listening, ProbeRequest, Reached};
 use crate::api::{ApiError, ErrorCode};
 use crate::host::Host;
 use crate::reach::{self, ReachError};
+
+use super::bad_request;
 
 /// The routes.
 pub(super) fn router() -> Router<Host> {
@@ -16,12 +20,18 @@ pub(super) fn router() -> Router<Host> {
         .route("/v1/reach/probe", post(probe))
 }
 
-async fn listen(Json(request): Json<ListenRequest>) -> Result<Json<Listening>, ApiError> {
+async fn listen(body: Bytes) -> Result<Json<Listening>, ApiError> {
+    let request: ListenRequest = parse(&body)?;
     reach::listen(request).await.map(Json).map_err(refused)
 }
 
-async fn probe(Json(request): Json<ProbeRequest>) -> Result<Json<Reached>, ApiError> {
+async fn probe(body: Bytes) -> Result<Json<Reached>, ApiError> {
+    let request: ProbeRequest = parse(&body)?;
     reach::probe(&request).await.map(Json).map_err(refused)
+}
+
+fn parse<T: DeserializeOwned>(body: &Bytes) -> Result<T, ApiError> {
+    serde_json::from_slice(body).map_err(|error| bad_request(&error.to_string()))
 }
 
 fn refused(error: ReachError) -> ApiError {

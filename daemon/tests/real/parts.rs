@@ -10,6 +10,7 @@ use ictus_deploy::Engine;
 use ictus_deploy::placement::{PortRange, Security, Way};
 use ictus_stream::Papers;
 use ictusd::api::part::{CommitRequest, HostRef, LeaseRequest, Part, PrepareRequest};
+use ictusd::api::reach::{ListenRequest, ProbeRequest};
 use ictusd::api::secret::SecretValues;
 use ictusd::api::{ErrorCode, Event, ExitReason, Outcome, StartRequest, State};
 use ictusd::client::ClientError;
@@ -433,4 +434,31 @@ async fn bytes_of_another_digest_are_refused() {
             .unwrap(),
         [wrong]
     );
+}
+
+#[tokio::test]
+async fn one_host_listens_and_another_says_the_word() {
+    let (one, two) = (World::new().await, World::new().await);
+    let word = "open".to_owned();
+    let listen = ListenRequest {
+        address: HOME,
+        ports: None,
+        word: word.clone(),
+        for_ms: 20_000,
+    };
+    let there = one.client.listen_for_a_while(&listen).await.unwrap();
+    let probe = ProbeRequest {
+        from: HOME,
+        to: SocketAddrV4::new(HOME, there.port),
+        word,
+        limit_ms: 10_000,
+    };
+    let reached = two.client.try_to_reach(&probe).await.unwrap();
+    assert_eq!((reached.tcp, reached.udp), (Ok(()), Ok(())));
+    let wordless = ListenRequest {
+        word: String::new(),
+        ..listen
+    };
+    let (code, _) = refusal(one.client.listen_for_a_while(&wordless).await.unwrap_err());
+    assert_eq!(code, ErrorCode::BadRequest);
 }
