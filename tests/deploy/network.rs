@@ -149,7 +149,8 @@ fn beat(rig: &Rig, head: &str, host_keys: &str) -> String {
 fn a_shut_way_is_named_with_the_rule_that_opens_it(rig: &Rig) {
     let operator = Operator::with_hosts(rig);
     let [first, second, _] = three(rig);
-    let file = operator.manifest("beat.yaml", &beat(rig, "", ", ports: 15045-15047"));
+    let head = "defaults: { stp_offset: 1 s }\n";
+    let file = operator.manifest("beat.yaml", &beat(rig, head, ", ports: 15045-15047"));
     let open = operator.fails(&["plan", &file], 2);
     assert!(!open.contains("cannot reach"), "{open}");
     second.drop_from(first.address, Traffic::Tcp(15_045));
