@@ -56,6 +56,7 @@ enum Command {
     Check(commands::check::Check),
     Plan(commands::plan::PlanCommand),
     Up(commands::up::Up),
+    Compose(commands::compose::ComposeCommand),
     Ps(commands::ps::Ps),
     Logs(commands::logs::Logs),
     Events(commands::events::Events),
@@ -83,6 +84,10 @@ enum Command {
     /// Have the program that was sent beside this one take its place, if it comes up
     #[command(hide = true)]
     Swap,
+    #[command(hide = true)]
+    Collect(commands::collect::Collect),
+    #[command(hide = true)]
+    Health(commands::health::Health),
     #[command(hide = true)]
     Supervise(commands::supervise::Supervise),
 }
@@ -145,6 +150,7 @@ fn run(cli: Cli) -> ExitCode {
         Command::Check(it) => it.run(&mut ui),
         Command::Plan(it) => it.run(&mut ui),
         Command::Up(it) => it.run(&mut ui),
+        Command::Compose(it) => it.run(&mut ui),
         Command::Ps(it) => it.run(&mut ui),
         Command::Logs(it) => it.run(&mut ui),
         Command::Events(it) => it.run(&mut ui),
@@ -164,6 +170,8 @@ fn run(cli: Cli) -> ExitCode {
         Command::Daemon => commands::daemon::run(),
         Command::DialStdio(it) => commands::dial_stdio::run(&it),
         Command::Swap => commands::swap::run(),
+        Command::Collect(it) => it.run(),
+        Command::Health(it) => it.run(),
         Command::Supervise(it) => it.run(),
     };
     match result {

@@ -2,11 +2,14 @@
 
 pub(crate) mod bench;
 pub(crate) mod check;
+pub(crate) mod collect;
+pub(crate) mod compose;
 pub(crate) mod daemon;
 pub(crate) mod dial_stdio;
 pub(crate) mod down;
 pub(crate) mod events;
 pub(crate) mod explain;
+pub(crate) mod health;
 pub(crate) mod history;
 pub(crate) mod host;
 pub(crate) mod init;

@@ -13,6 +13,7 @@ mod rollout;
 mod runs;
 mod secrets;
 mod session;
+mod stack;
 mod ui;
 
 fn main() -> ExitCode {

@@ -17,6 +17,7 @@ use tokio::runtime::Runtime;
 use crate::args::ManifestArgs;
 use crate::error::{CliError, Kind};
 use crate::hosts::{Clients, connect_all, left, others, ways};
+use crate::stack::{self, Stack};
 use crate::ui::Ui;
 
 /// A command's connection to this user's daemon.
@@ -119,6 +120,12 @@ impl Whereabouts {
         given: Option<&str>,
     ) -> Result<Option<Abroad>, CliError> {
         session.block_on(self.find(session, given))
+    }
+
+    /// The federation that is meant, when docker-compose runs it on this machine.
+    pub(crate) fn stack(&self, session: &Session, given: Option<&str>) -> Option<Stack> {
+        let here = self.hosts.is_empty();
+        here.then(|| stack::find(session, given)).flatten()
     }
 
     /// The hosts that are meant, by `--host` or by a manifest with hosts; absent: this machine.
@@ -234,18 +241,30 @@ fn unbuilt(manifest: &Path) -> Result<Checked, CliError> {
 }
 
 /// The federation's name in a manifest.
-fn name_in(manifest: &Path) -> Result<String, CliError> {
+pub(crate) fn name_in(manifest: &Path) -> Result<String, CliError> {
     Ok(unbuilt(manifest)?.plan.federation)
 }
 
 /// Checks a manifest, building its programs, and says so stage by stage.
 pub(crate) fn checked(ui: &mut Ui, args: &ManifestArgs, build: bool) -> Result<Checked, CliError> {
-    let path = args.path()?;
-    let overrides = args.set.iter().cloned().collect();
     let options = CheckOptions {
         build,
-        overrides,
         ..CheckOptions::default()
+    };
+    checked_as(ui, args, options)
+}
+
+/// The same with other options; those of `--set` are added.
+pub(crate) fn checked_as(
+    ui: &mut Ui,
+    args: &ManifestArgs,
+    options: CheckOptions,
+) -> Result<Checked, CliError> {
+    let path = args.path()?;
+    let build = options.build;
+    let options = CheckOptions {
+        overrides: args.set.iter().cloned().collect(),
+        ..options
     };
     let start = Instant::now();
     let mut built = Vec::new();

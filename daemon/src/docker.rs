@@ -270,29 +270,42 @@ impl Engine {
         let mut removed = 0;
         for image in images {
             // Several names are no reason to keep it; a container is, also with force while it runs.
-            for name in image
-                .repo_tags
-                .iter()
-                .filter(|name| !name.starts_with('<'))
-                .chain([&image.id])
-            {
-                let options = RemoveImageOptions {
-                    force: false,
-                    noprune: false,
-                    platforms: None,
-                };
-                let gone = self.docker.remove_image(name, Some(options), None);
-                match timeout(ANSWER_MAX, gone).await {
-                    Ok(Err(error)) if is_not_found(&error) => {}
-                    Ok(Err(error)) if is_conflict(&error) => break,
-                    gone => {
-                        told(format!("remove image {name}"), gone)?;
-                    }
+            let names = image.repo_tags.iter();
+            for name in names.filter(|name| !name.starts_with('<')) {
+                if !self.remove_image_name(name).await? {
+                    break;
                 }
             }
-            removed += usize::from(!self.has_image(&image.id).await?);
+            removed += usize::from(self.remove_unused_image(&image.id).await?);
         }
         Ok(removed)
+    }
+
+    /// Removes an image by its id unless a name or a container uses it; gives whether it is gone.
+    ///
+    /// # Errors
+    /// See [`Self::remove_images`].
+    pub(crate) async fn remove_unused_image(&self, id: &str) -> Result<bool, EngineError> {
+        let named = self.inspect_image(id).await?;
+        if named.is_some_and(|image| image.names == 0) {
+            self.remove_image_name(id).await?;
+        }
+        Ok(!self.has_image(id).await?)
+    }
+
+    /// Removes one name of an image, and the image with its last one; false when it is used.
+    async fn remove_image_name(&self, name: &str) -> Result<bool, EngineError> {
+        let options = RemoveImageOptions {
+            force: false,
+            noprune: false,
+            platforms: None,
+        };
+        let gone = self.docker.remove_image(name, Some(options), None);
+        match timeout(ANSWER_MAX, gone).await {
+            Ok(Err(error)) if is_not_found(&error) => Ok(true),
+            Ok(Err(error)) if is_conflict(&error) => Ok(false),
+            gone => told(format!("remove image {name}"), gone).map(|_| true),
+        }
     }
 
     /// Makes a container and starts it; gives its id.

@@ -3,13 +3,15 @@
 //! - [`supervisor`]: one small process per federate, which outlives the daemon;
 //! - [`agent`]: what to do next, as a state machine without I/O;
 //! - [`daemon`]: the process that owns federations and serves [`api`] on a Unix socket;
-//! - [`client`]: what the command line uses.
+//! - [`client`]: what the command line uses;
+//! - [`collector`], [`images`]: what a federation needs that Compose starts, without a daemon.
 
 pub mod accounts;
 pub mod agent;
 pub mod api;
 pub mod blobs;
 pub mod client;
+pub mod collector;
 pub mod daemon;
 mod docker;
 mod facts;
@@ -18,6 +20,7 @@ mod files;
 mod history;
 mod host;
 pub mod identity;
+pub mod compose_images;
 pub mod images;
 mod leases;
 pub mod logs;

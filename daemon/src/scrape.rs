@@ -20,6 +20,7 @@ use tokio::sync::Semaphore;
 use tokio::task::AbortHandle;
 use tokio::time::{sleep, timeout};
 
+use crate::collector::Collector;
 use crate::host::Host;
 
 /// Connections at a time on one address; further ones wait.
@@ -65,7 +66,8 @@ impl Listeners {
             listener.set_nonblocking(true)?;
             let listener = TcpListener::from_std(listener)?;
             let address = listener.local_addr()?;
-            let task = tokio::spawn(serve(listener, host.clone())).abort_handle();
+            let pages = Pages::Host(host.clone());
+            let task = tokio::spawn(serve(listener, pages)).abort_handle();
             let federations = BTreeSet::new();
             let listener = Listener {
                 address,
@@ -99,7 +101,26 @@ impl Listeners {
     }
 }
 
-async fn serve(listener: TcpListener, host: Host) {
+/// Whose page is shown.
+#[derive(Clone, Debug)]
+pub(crate) enum Pages {
+    /// That of all federations of this host.
+    Host(Host),
+    /// That of one, which no daemon knows.
+    Collector(Collector),
+}
+
+impl Pages {
+    async fn metrics(&self) -> String {
+        match self {
+            Self::Host(host) => host.metrics().await,
+            Self::Collector(collector) => collector.page(),
+        }
+    }
+}
+
+/// Answers whoever connects.
+pub(crate) async fn serve(listener: TcpListener, pages: Pages) {
     let slots = Arc::new(Semaphore::new(CONNECTIONS_MAX));
     loop {
         // Never closed.
@@ -108,9 +129,9 @@ async fn serve(listener: TcpListener, host: Host) {
         };
         match listener.accept().await {
             Ok((stream, _)) => {
-                let host = host.clone();
+                let pages = pages.clone();
                 tokio::spawn(async move {
-                    timeout(CONNECTION_MAX, converse(stream, host)).await.ok();
+                    timeout(CONNECTION_MAX, converse(stream, pages)).await.ok();
                     drop(slot);
                 });
             }
@@ -123,10 +144,10 @@ async fn serve(listener: TcpListener, host: Host) {
 }
 
 /// Answers one request.
-async fn converse(stream: TcpStream, host: Host) {
+async fn converse(stream: TcpStream, pages: Pages) {
     let service = service_fn(move |request| {
-        let host = host.clone();
-        async move { Ok::<_, Infallible>(answer(&request, &host).await) }
+        let pages = pages.clone();
+        async move { Ok::<_, Infallible>(answer(&request, &pages).await) }
     });
     let mut server = http1::Builder::new();
     server
@@ -139,7 +160,7 @@ async fn converse(stream: TcpStream, host: Host) {
     }
 }
 
-async fn answer(request: &Request<Incoming>, host: &Host) -> Response<Full<Bytes>> {
+async fn answer(request: &Request<Incoming>, pages: &Pages) -> Response<Full<Bytes>> {
     let reading = [Method::GET, Method::HEAD].contains(request.method());
     let (status, kind, text) = match request.uri().path() {
         "/metrics" | "/healthz" if !reading => (
@@ -150,7 +171,7 @@ async fn answer(request: &Request<Incoming>, host: &Host) -> Response<Full<Bytes
         "/metrics" => (
             StatusCode::OK,
             ictus_metrics::CONTENT_TYPE,
-            host.metrics().await,
+            pages.metrics().await,
         ),
         "/healthz" => (StatusCode::OK, PLAIN, "ok\n".to_owned()),
         _ => (

@@ -27,7 +27,7 @@ mod control;
 pub mod exit;
 mod history;
 pub mod limits;
-mod lines;
+pub(crate) mod lines;
 pub(crate) mod log;
 pub(crate) mod process;
 pub mod protocol;

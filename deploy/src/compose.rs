@@ -108,7 +108,7 @@ impl Compose {
             services.push((run.name.clone(), writer.federate(run, federate)?));
         }
         let mut volumes = Vec::new();
-        if options.monitoring {
+        if writer.collects() {
             monitoring::add(&mut writer, &mut services, &mut volumes)?;
         }
         let file = File {
@@ -185,6 +185,11 @@ impl<'a> Writer<'a> {
             .need(&self.checked.plan.federation, what, source)
     }
 
+    /// Whether there is a collector: when monitoring is asked for, or metrics are to be served.
+    fn collects(&self) -> bool {
+        self.options.monitoring || self.checked.settings.metrics_listen.is_some()
+    }
+
     fn port(&self) -> u16 {
         self.checked.settings.rti_port.unwrap_or(RTI_PORT)
     }
@@ -247,7 +252,7 @@ impl<'a> Writer<'a> {
             let plan = Variable::Plan(self.plan.clone());
             service.environment.insert(PLAN_VARIABLE.to_owned(), plan);
             self.traces(&mut service)?;
-            if self.options.monitoring {
+            if self.collects() {
                 service.volumes.push(monitoring::shared(false));
             }
         }
@@ -274,7 +279,7 @@ impl<'a> Writer<'a> {
         if self.options.trace.is_some() {
             command.extend(["--trace", TRACE]);
         }
-        if self.options.monitoring {
+        if self.collects() {
             command.extend(["--status-socket", monitoring::SOCKET]);
         }
         command.into_iter().map(str::to_owned).collect()

@@ -34,6 +34,16 @@ impl Down {
     pub(crate) fn run(&self, ui: &mut Ui) -> Result<(), CliError> {
         let session = Session::new()?;
         let given = self.name.as_deref();
+        if let Some(stack) = self.at.stack(&session, given) {
+            return session.block_on(async {
+                stack.down(self.timeout).await?;
+                if self.purge {
+                    stack.purge().await?;
+                }
+                ui.stage("down", &stack.name);
+                Ok(())
+            });
+        }
         if let Some(abroad) = self.at.abroad(&session, given)? {
             return session.block_on(self.everywhere(ui, &session, &abroad));
         }

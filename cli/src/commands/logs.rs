@@ -29,6 +29,9 @@ impl Logs {
     pub(crate) fn run(&self, ui: &mut Ui) -> Result<(), CliError> {
         let session = Session::new()?;
         let first = self.names.first().map(String::as_str);
+        if let Some(stack) = self.at.stack(&session, first) {
+            return session.block_on(stack.show(&self.of_stack()));
+        }
         if let Some(abroad) = self.at.abroad(&session, first)? {
             return session.block_on(self.everywhere(ui, &session, &abroad));
         }
@@ -44,6 +47,16 @@ impl Logs {
             }
             Ok(())
         })
+    }
+
+    /// What docker-compose is asked for; a name that is left out is that of the only federation.
+    fn of_stack(&self) -> Vec<String> {
+        let mut words = vec!["logs".to_owned(), "--no-color".to_owned()];
+        words.extend(self.follow.then(|| "--follow".to_owned()));
+        words.extend(self.tail.map(|lines| format!("--tail={lines}")));
+        words.push("--".to_owned());
+        words.extend(self.names.iter().skip(1).cloned());
+        words
     }
 
     /// Those of all hosts: what is there by time, what comes as it comes.

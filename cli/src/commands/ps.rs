@@ -33,6 +33,9 @@ impl Ps {
     pub(crate) fn run(&self, ui: &mut Ui) -> Result<(), CliError> {
         let session = Session::new()?;
         let given = self.name.as_deref();
+        if let Some(stack) = self.at.stack(&session, given) {
+            return session.block_on(stack.show(&["ps"]));
+        }
         if let Some(abroad) = self.at.abroad(&session, given)? {
             return session.block_on(self.everywhere(ui, &session, &abroad));
         }

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
 use clap::Args;
-use ictus_deploy::{Checked, Placement};
+use ictus_deploy::{Checked, Deploy, Placement};
 use ictusd::api::secret::StartCall;
 use ictusd::api::{ErrorCode, Event, Happening, Outcome};
 use ictusd::client::{Client, ClientError, Stream, is_already_running};
@@ -19,6 +19,7 @@ use crate::interrupts::Interrupts;
 use crate::rollout::{Executor, Rollout, SavedPlan, patience, size};
 use crate::secrets::Secrets;
 use crate::session::{Session, checked, count, request, succeed};
+use crate::stack::Stack;
 use crate::ui::Ui;
 
 /// How often `--attach` finds the daemon again before it gives up.
@@ -74,6 +75,9 @@ impl Up {
             return self.follow_plan(ui, &session, saved);
         }
         let checked = checked(ui, &self.manifest, true)?;
+        if checked.deploy == Deploy::Compose {
+            return session.block_on(self.compose(ui, &session, &checked));
+        }
         if let Some(placement) = &checked.placement {
             let work = self.roll_out(ui, &session, (&checked, placement), None);
             return session.block_on(work);
@@ -143,6 +147,28 @@ impl Up {
         };
         let work = self.roll_out(ui, session, (&checked, placement), Some(saved));
         session.block_on(work)
+    }
+
+    /// The same by docker-compose.
+    async fn compose(
+        &self,
+        ui: &mut Ui,
+        session: &Session,
+        checked: &Checked,
+    ) -> Result<(), CliError> {
+        if self.attach {
+            let message = "`--attach` is for federations that the daemon starts";
+            return Err(CliError::failed(message).hint("`ictus logs -f` shows what they say"));
+        }
+        let name = &checked.plan.federation;
+        let stack = Stack::of(session, name);
+        stack.up(ui, (checked, self.trace), self.timeout).await?;
+        ui.result(&serde_json::json!({ "federation": name }), || {
+            let federates = count(checked.federates.len(), "federate");
+            format!(
+                "{name} was started: {federates}\n  ictus ps {name}\n  ictus logs -f {name}\n  ictus down {name}"
+            )
+        })
     }
 
     /// The same over the manifest's hosts.

@@ -5,7 +5,7 @@ use std::net::{Ipv4Addr, SocketAddrV4};
 use std::path::{Path, PathBuf};
 
 use ictus_deploy::placement::Security;
-use ictus_deploy::{Engine, FederateKind, FederateRun};
+use ictus_deploy::{FederateKind, FederateRun, rti};
 
 use crate::agent::{MemberId, RTI};
 use crate::api::StartRequest;
@@ -216,7 +216,7 @@ fn allowed(part: &Part) -> String {
 
 fn rti_args(request: &StartRequest, federation_id: &str, prepared: Option<u16>) -> Vec<String> {
     let port = prepared.or(request.settings.rti_port).unwrap_or(0);
-    ictus_deploy::rti::arguments(&request.plan, federation_id, port)
+    rti::arguments(&request.plan, federation_id, port)
 }
 
 #[cfg(test)]

@@ -29,6 +29,8 @@ datasources:
 pub const COLLECTOR_PORT: u16 = 9464;
 /// Where federates find the collector, below [`SHARED`].
 pub const SOCKET: &str = "/ictus/status/collector.sock";
+/// Its name there.
+pub const SOCKET_NAME: &str = "collector.sock";
 /// Where the shared volume is mounted.
 pub const SHARED: &str = "/ictus/status";
 /// The shared volume.
@@ -41,25 +43,24 @@ pub(super) fn shared(read_only: bool) -> Mount {
     Mount::volume(STATUS, SHARED).read_only(read_only)
 }
 
-/// Adds the three services and their volumes.
+/// Adds the services and their volumes.
 pub(super) fn add(
     writer: &mut Writer<'_>,
     services: &mut Vec<(String, Service)>,
     volumes: &mut Vec<(String, NamedVolume)>,
 ) -> Result<(), ComposeError> {
-    let more = [
-        (COLLECTOR, collector(writer)),
-        ("prometheus", prometheus()),
-        ("grafana", grafana()),
-    ];
+    let mut more = vec![(COLLECTOR, collector(writer))];
+    volumes.push((STATUS.to_owned(), NamedVolume::shared_memory()));
+    if writer.options.monitoring {
+        more.extend([("prometheus", prometheus()), ("grafana", grafana())]);
+        volumes.push((MEASURED.to_owned(), NamedVolume::kept()));
+    }
     for (name, service) in more {
         if services.iter().any(|(taken, _)| taken == name) {
             return Err(ComposeError::NameTaken(name.to_owned()));
         }
         services.push((name.to_owned(), service));
     }
-    volumes.push((STATUS.to_owned(), NamedVolume::shared_memory()));
-    volumes.push((MEASURED.to_owned(), NamedVolume::kept()));
     Ok(())
 }
 

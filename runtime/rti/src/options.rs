@@ -48,6 +48,7 @@ Coordinates one federation; takes the options of Lingua Franca's RTI.
       --continue ID[,ID]...     go on when one of these federates is lost: as if it had resigned
       --failure-timeout MS      how long another host may answer nothing at all before its federates count
                                 as lost, in milliseconds from 1000 to 3600000 (default 10000)
+      --join-timeout MS         give up when they have not all joined after so many milliseconds
       --max-payload SIZE        the longest payload of one message, in bytes or with K, M or G
                                 (default 64M); a longer one fails its sender; Ictus programs
                                 themselves take no longer ones than 64M
@@ -86,6 +87,8 @@ pub struct Options {
     pub failure_timeout: Duration,
     /// The TCP port to listen on; 0: the system chooses one.
     pub port: u16,
+    /// How long federates may take to join, from when the RTI listens; absent: for ever.
+    pub join_timeout: Option<std::time::Duration>,
     /// The UDP port from which clocks are compared; 0: the system chooses one.
     pub clock_port: u16,
     /// Who says when a datagram came.
@@ -143,6 +146,7 @@ impl Options {
             bind_is_default: true,
             failure_timeout: FAILURE_TIMEOUT,
             port: 0,
+            join_timeout: None,
             clock_port: 0,
             stamps: Stamps::Kernel,
             status_fd: None,
@@ -214,6 +218,10 @@ impl Parser {
             "-a" | "--auth" => self.options.config.authentication = true,
             "--continue" => self.continue_without(option)?,
             "--allow" => self.allow(option)?,
+            "--join-timeout" => {
+                let ms = self.number(option, "a number of milliseconds")?;
+                self.options.join_timeout = Some(std::time::Duration::from_millis(ms));
+            }
             "--clock-port" => {
                 self.options.clock_port = self.number(option, "a port (0 to 65535)")?;
             }

@@ -4,7 +4,7 @@ use std::io::{self, Read};
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::os::fd::BorrowedFd;
 use std::path::{Path, PathBuf};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use ictus_clock::{HostClock, Lookout, ask_often, give_up};
 use ictus_coord::auth::Nonce;
@@ -59,6 +59,10 @@ pub struct Server {
     credentials: Option<Credentials>,
     buffer: Vec<u8>,
     port: u16,
+    /// How long federates may take to join; absent: for ever.
+    join_timeout: Option<Duration>,
+    /// Until when they may, while they have not all joined.
+    join_until: Option<Instant>,
     /// Nobody chose the address: only this host's federates can join.
     bind_is_default: bool,
 }
@@ -163,6 +167,8 @@ impl Server {
             lookout: Lookout::new(options.failure_timeout),
             failure_timeout: options.failure_timeout,
             credentials,
+            join_timeout: options.join_timeout,
+            join_until: None,
             bind_is_default: options.bind_is_default,
         })
     }
@@ -199,6 +205,7 @@ impl Server {
     /// When the system refuses to wait for events.
     pub fn run(mut self) -> Result<u8, BindError> {
         self.status.listening(self.port, self.bind_is_default);
+        self.join_until = self.join_timeout.map(|limit| Instant::now() + limit);
         let mut events = Events::with_capacity(1024);
         loop {
             match self.poll.poll(&mut events, self.patience()) {
@@ -221,6 +228,7 @@ impl Server {
             {
                 self.rti.handle_timeout(now);
             }
+            self.expect_all(now);
             self.rti.drain(now);
             self.write_round(&woken);
             self.probe();
@@ -239,6 +247,8 @@ impl Server {
         if readable || probed || self.accepting == Accepting::Ready {
             return Some(Duration::ZERO);
         }
+        let until = self.join_until;
+        let until = until.map(|until| until.saturating_duration_since(Instant::now()));
         let stuck = self.accepting == Accepting::Stuck;
         let again = (stuck || self.status.is_behind()).then_some(TRY_AGAIN);
         let deadline = self
@@ -247,7 +257,10 @@ impl Server {
             .map(|deadline| deadline.since(self.clock.now()).to_std() + Duration::from_millis(1));
         let lookout = self.watched().next().map(|_| self.lookout.patience());
         let lookout = lookout.map(|it| it.to_std() + Duration::from_millis(1));
-        again.into_iter().chain(deadline).chain(lookout).min()
+        [until, again, deadline, lookout]
+            .into_iter()
+            .flatten()
+            .min()
     }
 
     /// The connections with other hosts.
@@ -272,6 +285,17 @@ impl Server {
                 let why = Disconnect::Silent { host, lasting };
                 self.remove(ConnectionId::from_index(index), now, &why);
             }
+        }
+    }
+
+    /// Gives up when federates have not joined in time.
+    fn expect_all(&mut self, now: PhysicalTime) {
+        if self.join_until.is_some_and(|until| until <= Instant::now()) {
+            self.join_until = None;
+            let limit = self.join_timeout.unwrap_or_default().as_secs_f64();
+            let words = format!("not all federates have joined within {limit} s: giving up");
+            self.status.say(&words);
+            self.rti.abort(now);
         }
     }
 
@@ -472,6 +496,9 @@ impl Server {
 
     fn report(&mut self) {
         while let Some(event) = self.rti.poll_event() {
+            if matches!(event, RtiEvent::Started { .. }) {
+                self.join_until = None;
+            }
             if matches!(event, RtiEvent::Ended { .. }) {
                 self.listener = None;
                 self.accepting = Accepting::Idle;

@@ -665,3 +665,14 @@ fn a_federate_that_answers_no_probe_keeps_nobody_waiting() {
     probed.peer.resign();
     assert_eq!(rti.ended(), 0);
 }
+
+/// Who does not join in time is not waited for; whoever has joined is told.
+#[test]
+fn federates_that_do_not_join_in_time_end_the_rti() {
+    let options = Options {
+        join_timeout: Some(Duration::from_millis(50)),
+        ..Options::new("test", 2)
+    };
+    let server = Server::bind(&options, Status::default()).unwrap();
+    assert_eq!(server.run().unwrap(), 1);
+}

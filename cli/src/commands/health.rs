@@ -1,0 +1,59 @@
+//! `ictus health`: whether something of this machine, or of this container, serves a TCP port. For health checks in images
+//! that hold nothing else; it connects to nobody, so that nobody is disturbed.
+
+use std::fs;
+
+use clap::Args;
+
+use crate::error::CliError;
+
+/// Say by the exit code whether a TCP port is listened on, or has connections
+#[derive(Debug, Args)]
+pub(crate) struct Health {
+    /// The port
+    port: u16,
+}
+
+impl Health {
+    pub(crate) fn run(&self) -> Result<(), CliError> {
+        let tables = ["/proc/net/tcp", "/proc/net/tcp6"];
+        let mut texts = tables
+            .iter()
+            .filter_map(|table| fs::read_to_string(table).ok());
+        if texts.any(|text| serves(&text, self.port)) {
+            return Ok(());
+        }
+        let message = format!("nothing serves port {}", self.port);
+        Err(CliError::failed(message))
+    }
+}
+
+/// Whether a table of the kernel's has a socket at a local port that listens or is connected.
+fn serves(table: &str, port: u16) -> bool {
+    const ESTABLISHED: &str = "01";
+    const LISTENING: &str = "0A";
+    let port = format!("{port:04X}");
+    table.lines().skip(1).any(|line| {
+        let mut fields = line.split_ascii_whitespace();
+        let (local, state) = (fields.nth(1), fields.nth(1));
+        let at = local.and_then(|local| local.rsplit_once(':'));
+        at.is_some_and(|(_, at)| at == port)
+            && state.is_some_and(|state| [ESTABLISHED, LISTENING].contains(&state))
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::serves;
+
+    #[test]
+    fn a_port_is_served_by_who_listens_or_is_connected() {
+        let table = "  sl  local_address rem_address   st tx_queue rx_queue\n   \
+            0: 0100007F:3AC5 00000000:0000 0A 00000000:00000000 00:00000000\n   \
+            1: 0100007F:1F90 0100007F:3AC5 01 00000000:00000000 00:00000000\n   \
+            2: 0100007F:0050 0100007F:3AC5 06 00000000:00000000 00:00000000\n";
+        assert!(serves(table, 0x3AC5) && serves(table, 0x1F90));
+        // The other end, one that is closing, and the heading.
+        assert!(!serves(table, 0x50) && !serves(table, 1) && !serves("", 80));
+    }
+}
