@@ -287,7 +287,7 @@ impl Engine {
     /// See [`Self::remove_images`].
     pub(crate) async fn remove_unused_image(&self, id: &str) -> Result<bool, EngineError> {
         let named = self.inspect_image(id).await?;
-        if named.is_some_and(|image| image.names == 0) {
+        if named.is_some_and(|image| image.tags.is_empty()) {
             self.remove_image_name(id).await?;
         }
         Ok(!self.has_image(id).await?)

@@ -229,8 +229,8 @@ pub(crate) const CODES: &[(&str, &str)] = &[
     ),
     (
         "F045",
-        "`deploy: compose` has docker-compose start everything on this machine, and `hosts` names several. \
-         Several hosts are the daemons' work: leave `deploy` out.",
+        "`deploy: compose` has docker-compose start everything on this machine, and `hosts` names others. \
+         Those are the daemons' work: leave `deploy` out.",
     ),
     (
         "W001",

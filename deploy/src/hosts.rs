@@ -100,17 +100,20 @@ impl<'a> Seating<'a> {
         Self { contained, ..self }
     }
 
-    /// Reports several hosts when Compose is to start it, which has one.
+    /// Reports hosts that Compose does not reach when it is to start everything: it has this machine.
     pub(crate) fn one_host(&self, manifest: &Manifest, report: &mut Report) {
+        if manifest.deploy != Deploy::Compose {
+            return;
+        }
         let used = self.used();
-        if manifest.deploy == Deploy::Compose && used.len() > 1 {
-            let names = used.iter().filter_map(|index| self.hosts.get(*index));
-            let names: Vec<_> = names.map(|(name, _)| name.as_str()).collect();
-            let message = format!(
-                "Compose starts what runs on one host, and this is on {}",
-                names.join(", ")
-            );
-            let fix = "remove `deploy: compose`, or all hosts but one";
+        let used: Vec<_> = used.iter().filter_map(|at| self.hosts.get(*at)).collect();
+        let away = used.iter().any(|(_, host)| host.ssh.is_some());
+        if used.len() > 1 || away {
+            let names: Vec<_> = used.iter().map(|(name, _)| name.as_str()).collect();
+            let names = names.join(", ");
+            let message =
+                format!("Compose starts what runs on this machine, and this is on {names}");
+            let fix = "remove `deploy: compose`, or `hosts`";
             report.add("F045", Place::value(&["deploy"]), message, fix);
         }
     }
