@@ -1,11 +1,7 @@
 //! `ictus compose`: the committed files, what both generations of Compose say of them, and a federation that
 //! docker-compose runs.
 
-#![expect(
-    clippy::unwrap_used,
-    clippy::panic,
-    reason = "a test stops at the first surprise"
-)]
+#![expect(clippy::unwrap_used, reason = "a test stops at the first surprise")]
 
 use std::fs;
 use std::io::{Read, Write};
@@ -18,7 +14,6 @@ use std::time::Duration;
 use ictus_deploy::compose::monitoring::PROMETHEUS_CONFIG;
 use ictus_deploy::trace::{TraceSet, Verdict, compare};
 use ictus_tests::{Sandbox, ictus, root, said};
-use serde_json::Value;
 use sha2::{Digest, Sha256};
 
 /// How long any command may take, in seconds; `timeout` of coreutils sees to it.

@@ -1,5 +1,7 @@
 //! Compose files as text: what stands in them, and who gets none.
 
+#![expect(clippy::unwrap_used, reason = "a test stops at the first surprise")]
+
 use std::path::PathBuf;
 
 use ictus_coord::plan::{FederatePlan, Plan};

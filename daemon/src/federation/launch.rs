@@ -5,7 +5,7 @@ use std::net::{Ipv4Addr, SocketAddrV4};
 use std::path::{Path, PathBuf};
 
 use ictus_deploy::placement::Security;
-use ictus_deploy::{FederateKind, FederateRun, rti};
+use ictus_deploy::{Engine, FederateKind, FederateRun, rti};
 
 use crate::agent::{MemberId, RTI};
 use crate::api::StartRequest;
