@@ -16,7 +16,6 @@ use crate::status::Status;
 use crate::transport::{self, Awaited, Connection, Signals, Waker};
 use ictus_clock::Lookout;
 use ictus_coord::FederateExecutor as _;
-use ictus_coord::auth::Nonce;
 use ictus_coord::clock::Interval;
 use ictus_coord::federate::{Federate, FederateConfig, FederateEvent, LinkConfig, Outcome, Poll};
 use ictus_coord::measure::LagNews;
@@ -24,16 +23,19 @@ use ictus_coord::plan::Plan;
 use ictus_coord::report::{FederateStatus, exit};
 use ictus_core::{Duration, PhysicalTime, Tag};
 use ictus_stream::{Credentials, Member};
-use nix::libc;
 use std::io::{self, Write};
-use std::net::{IpAddr, Ipv4Addr, SocketAddr, ToSocketAddrs};
+use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::process::ExitCode;
 use std::sync::Arc;
 
+mod begin;
 mod error;
 mod lookout;
 mod report;
 
+use begin::{
+    connect, default_federation, lock_memory, named_federates, nonce, read_plan, resolve, status_of,
+};
 pub use error::RunError;
 
 /// Written bytes leave at once beyond this many, although the federate is not about to wait.
@@ -46,8 +48,6 @@ const BACKLOG_BYTES: usize = 4 << 20;
 const BACKLOG_LOOK: Duration = Duration::from_secs(1);
 /// A federate that never waits still looks at its socket after so many steps.
 const STEPS_PER_LOOK: u32 = 64;
-/// How long a connect is retried: the RTI may start after its federates.
-const CONNECT_FOR: Duration = Duration::from_secs(60);
 /// How long the RTI may take to close after RESIGN or FAILED.
 const DRAIN_FOR: Duration = Duration::from_secs(5);
 /// How long a receiver may take nothing of the last messages for it.
@@ -125,40 +125,6 @@ fn run_plan(args: &RunArgs, classes: &[Class]) -> Result<u8, RunError> {
     }
 }
 
-/// The plan, from a file or, where there is no file to share (`ictus compose`), from the environment.
-fn read_plan(args: &RunArgs) -> Result<Plan, RunError> {
-    if let Some(name) = &args.plan_env {
-        let text = std::env::var(name).map_err(|_| RunError::NoPlan { name: name.clone() })?;
-        return serde_json::from_str(&text).map_err(|source| RunError::ParsePlan {
-            path: name.into(),
-            source,
-        });
-    }
-    let path = || args.plan.clone();
-    let text = std::fs::read(&args.plan).map_err(|source| RunError::ReadPlan {
-        path: path(),
-        source,
-    })?;
-    serde_json::from_slice(&text).map_err(|source| RunError::ParsePlan {
-        path: path(),
-        source,
-    })
-}
-
-/// No page of this process, now or later, is written to swap or waited for. Executing a program undoes it, so nobody else
-/// can do it for us.
-#[expect(
-    unsafe_code,
-    reason = "mlockall stands behind features of nix and rustix that nothing else needs"
-)]
-fn lock_memory() -> io::Result<()> {
-    // SAFETY: it takes flags only, and changes nothing that a program could observe in its memory.
-    match unsafe { libc::mlockall(libc::MCL_CURRENT | libc::MCL_FUTURE) } {
-        0 => Ok(()),
-        _ => Err(io::Error::last_os_error()),
-    }
-}
-
 /// Every named federate on a thread of its own; the worst exit code wins.
 fn run_each(
     plan: &Plan,
@@ -195,38 +161,6 @@ fn run_each(
         worst = worst.max(result?);
     }
     Ok(worst)
-}
-
-fn named_federates(plan: &Plan, names: &[String]) -> Result<Vec<u16>, RunError> {
-    let index = |name: &String| {
-        let found = plan.federates.iter().position(|f| f.name == *name);
-        let id = found.and_then(|index| u16::try_from(index).ok());
-        id.ok_or_else(|| RunError::UnknownFederate {
-            name: name.clone(),
-            known: plan.federates.iter().map(|f| f.name.clone()).collect(),
-        })
-    };
-    if names.is_empty() {
-        let count = u16::try_from(plan.federates.len()).unwrap_or(u16::MAX);
-        Ok((0..count).collect())
-    } else {
-        names.iter().map(index).collect()
-    }
-}
-
-fn resolve(rti: &str) -> Result<SocketAddr, RunError> {
-    let refused = || RunError::BadAddress {
-        address: rti.to_owned(),
-    };
-    // `user@host:port` is what LF's launcher passes.
-    let host = rti.rsplit('@').next().unwrap_or(rti);
-    let host = if host.contains(':') {
-        host.to_owned()
-    } else {
-        format!("{host}:15045")
-    };
-    let mut addresses = host.to_socket_addrs().map_err(|_| refused())?;
-    addresses.find(SocketAddr::is_ipv4).ok_or_else(refused)
 }
 
 /// What is to be run.
@@ -310,14 +244,6 @@ fn run_one(job: &Job<'_>, ids: &[u16], rti: Option<SocketAddr>) -> Result<u8, Ru
     runner.run()
 }
 
-/// Where status lines go. Who takes them from a socket may come later, or go away: that is no reason to fail.
-fn status_of(args: &RunArgs) -> io::Result<Status> {
-    match &args.status_socket {
-        Some(path) => Ok(Status::to_socket(path)),
-        None => Status::new(args.status_fd),
-    }
-}
-
 /// The clock that one federate's plan asks for; several in one process have one host's.
 fn clock_of(plan: &Plan, ids: &[u16], rti: Option<SocketAddr>) -> SystemClock {
     match (rti, ids) {
@@ -358,18 +284,6 @@ fn check_clock(sync: &mut ClockSync, name: &str) -> Result<(), ClockRefusal> {
     }
 }
 
-/// LF's default on both sides.
-fn default_federation() -> String {
-    "Unidentified Federation".to_owned()
-}
-
-/// Random bytes for the authentication.
-fn nonce() -> Result<Nonce, RunError> {
-    let mut nonce = Nonce::default();
-    getrandom::fill(&mut nonce).map_err(|error| RunError::Io(error.into()))?;
-    Ok(nonce)
-}
-
 /// What a federate shows, if it is to show anything.
 fn credentials(job: &Job<'_>, ids: &[u16]) -> Result<Option<Credentials>, RunError> {
     let (Some(directory), [id]) = (&job.args.tls, ids) else {
@@ -381,21 +295,6 @@ fn credentials(job: &Job<'_>, ids: &[u16]) -> Result<Option<Credentials>, RunErr
         source,
     })?;
     Ok(Some(credentials))
-}
-
-fn connect(address: SocketAddr, credentials: Option<&Credentials>) -> Result<Connection, RunError> {
-    let to = credentials.map(|credentials| (credentials, Member::Rti));
-    let clock = SystemClock::new();
-    let until = clock.now() + CONNECT_FOR;
-    loop {
-        match Connection::open(address, Duration::from_secs(5), to) {
-            Ok(connection) => return Ok(connection),
-            Err(source) if clock.now() > until => {
-                return Err(RunError::Connect { address, source });
-            }
-            Err(_) => std::thread::sleep(std::time::Duration::from_millis(20)),
-        }
-    }
 }
 
 #[derive(Debug)]
