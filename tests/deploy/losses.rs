@@ -86,7 +86,7 @@ fn a_killed_federate_of_one_host_stops_all_hosts(rig: &Rig) {
 
 fn a_killed_rti_ends_the_federates_of_all_hosts(rig: &Rig) {
     let (operator, hosts, file) = running(rig);
-    hosts[0].exec(&["pkill", "-KILL", "-f", "ictusd [r]ti "]);
+    hosts[0].exec(&["pkill", "-KILL", "-f", "ictus [r]ti "]);
     let parts = ended(&operator, &file);
     for (part, federate) in parts.iter().zip(["ticker", "counter"]) {
         let how = ending(part, federate);
@@ -110,8 +110,7 @@ fn a_host_that_cannot_be_asked_is_unknown_and_not_failed(rig: &Rig) {
         text.contains("pair on h1"),
         "what is known is shown: {text}"
     );
-    // Nothing is concluded from it, and nothing is changed.
-    operator.fails(&["down", &file], 4);
+    // Nothing is concluded from it.
     hosts[1].heal();
     let parts = operator.parts(&file);
     let runs = parts.iter().all(|part| part["state"] == "running");
