@@ -22,8 +22,8 @@ pub mod image;
 pub mod monitoring;
 
 use file::{
-    Depends, File, Healthcheck, Line, Logging, Mount, MountedSecret, SecretFile, Service, Table,
-    Variable,
+    Build, Depends, File, Healthcheck, Line, Logging, Mount, MountedSecret, SecretFile, Service,
+    Table, Variable,
 };
 use image::{ImageSource, Images};
 
@@ -229,9 +229,11 @@ impl<'a> Writer<'a> {
                 (image, self.our_command(run, &rti))
             }
             FederateKind::Foreign { args } => {
-                let image = match &run.needs.image {
-                    Some(image) => image.clone(),
-                    None => self.image(&format!("federate.{}", run.name), source),
+                let what = format!("federate.{}", run.name);
+                let image = match (&run.needs.image, &run.needs.build) {
+                    (Some(image), _) => image.clone(),
+                    (None, Some(_)) => image::reference(&self.checked.plan.federation, &what),
+                    (None, None) => self.image(&what, source),
                 };
                 let command = ["-i", &self.id, "--rti", &rti].map(str::to_owned);
                 let args = args.iter().map(|arg| literal(arg));
@@ -256,7 +258,13 @@ impl<'a> Writer<'a> {
                 service.volumes.push(monitoring::shared(false));
             }
         }
-        if run.needs.image.is_some() {
+        if let Some(build) = &run.needs.build {
+            service.build = Some(Build {
+                context: text(&build.context)?,
+                dockerfile: literal(&build.dockerfile),
+            });
+        }
+        if run.needs.has_image() {
             // What somebody else's image writes where, we do not know.
             (service.read_only, service.tmpfs) = (false, Line::default());
         }

@@ -7,6 +7,7 @@ use std::path::PathBuf;
 use ictus_coord::plan::{FederatePlan, Plan};
 use ictus_deploy::compose::image::{ImageSource, REPOSITORY};
 use ictus_deploy::compose::{Compose, ComposeError, ComposeOptions};
+use ictus_deploy::placement::ImageBuild;
 use ictus_deploy::{Checked, Deploy, FederateKind, FederateRun, Placement, Settings, TimingSpec};
 use proptest::prelude::*;
 
@@ -123,5 +124,25 @@ proptest! {
         let plan = read["services"]["a"]["environment"]["ICTUS_PLAN"].as_str().unwrap();
         let plan: Plan = serde_json::from_str(&plan.replace("$$", "$")).unwrap();
         prop_assert_eq!(plan, federation.plan);
+    }
+}
+
+#[test]
+fn compose_builds_what_the_manifest_has_built() {
+    let mut checked = checked("demo", &["a"]);
+    checked.federates[0].kind = FederateKind::Foreign { args: Vec::new() };
+    checked.federates[0].needs.build = Some(ImageBuild {
+        context: "/home/ann/camera".into(),
+        dockerfile: "Dockerfile".to_owned(),
+    });
+    let compose = plain(&checked).unwrap();
+    // Nobody else makes it.
+    assert_eq!(compose.images.len(), 1, "the RTI's alone");
+    for words in [
+        "context: /home/ann/camera",
+        "dockerfile: Dockerfile",
+        &format!("{REPOSITORY}:demo.federate.a"),
+    ] {
+        assert!(compose.text.contains(words), "{words}: {}", compose.text);
     }
 }

@@ -56,6 +56,9 @@ impl File {
 /// A container.
 #[derive(Clone, Debug, Default, Serialize)]
 pub(super) struct Service {
+    /// Who else is to make the image: Compose, from a folder.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub(super) build: Option<Build>,
     pub(super) image: String,
     #[serde(skip_serializing_if = "Line::is_empty")]
     pub(super) command: Line,
@@ -97,6 +100,13 @@ pub(super) struct Service {
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(super) stop_grace_period: Option<String>,
     pub(super) logging: Logging,
+}
+
+/// A folder of which Compose builds an image.
+#[derive(Clone, Debug, Serialize)]
+pub(super) struct Build {
+    pub(super) context: String,
+    pub(super) dockerfile: String,
 }
 
 /// A sequence on one line.

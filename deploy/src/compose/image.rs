@@ -57,11 +57,7 @@ pub(super) struct Images(Vec<LocalImage>);
 impl Images {
     /// Notes an image; gives its name. No name of a federation, program or federate has a dot.
     pub(super) fn need(&mut self, federation: &str, what: &str, source: ImageSource) -> String {
-        let mut tag = format!("{federation}.{what}");
-        if tag.len() > TAG_MAX {
-            tag = crate::image::hex(&Sha256::digest(&tag));
-        }
-        let reference = format!("{REPOSITORY}:{tag}");
+        let reference = reference(federation, what);
         if !self.0.iter().any(|image| image.reference == reference) {
             self.0.push(LocalImage {
                 reference: reference.clone(),
@@ -75,4 +71,13 @@ impl Images {
     pub(super) fn into_needed(self) -> Vec<LocalImage> {
         self.0
     }
+}
+
+/// The name of an image of a federation.
+pub(super) fn reference(federation: &str, what: &str) -> String {
+    let mut tag = format!("{federation}.{what}");
+    if tag.len() > TAG_MAX {
+        tag = crate::image::hex(&Sha256::digest(&tag));
+    }
+    format!("{REPOSITORY}:{tag}")
 }
