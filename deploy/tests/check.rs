@@ -278,7 +278,7 @@ fn the_example_is_placed() {
     assert_eq!(names, ["bench", "nuc", "vision"]);
     assert_eq!(
         (placement.rti, placement.federates),
-        (1, vec![1, 0, 0, 0, 2])
+        (1, vec![1, 0, 0, 0, 2, 2])
     );
     let nuc = &placement.hosts[1];
     assert_eq!(nuc.address, Ipv4Addr::new(10, 0, 0, 11));
@@ -524,7 +524,7 @@ fn without_build_nothing_runs() {
     };
     let checked = bench.check(&options).unwrap_or_else(|p| panic!("{p}"));
     assert!(checked.federates.is_empty());
-    assert_eq!(checked.plan.federates.len(), 5);
+    assert_eq!(checked.plan.federates.len(), 6);
 }
 
 /// Every `testdata/bad/NAME.yaml` gives the text of `NAME.txt`; `UPDATE=1` writes it anew.

@@ -102,6 +102,9 @@ fn the_verbs_work_over_hosts(rig: &Rig) {
     ] {
         assert!(down.contains(words), "{words}: {down}");
     }
+    // Also those of one member alone, wherever it was.
+    let logs = operator.ok(&["logs", "diamond", "rti", "--host", &host]);
+    assert!(!logs.contains("error") && logs.contains(" rti "), "{logs}");
     let history = json(&operator, &["history", "diamond", "--host", &host]);
     assert_eq!(
         history[0]["hosts"],

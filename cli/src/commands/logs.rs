@@ -1,7 +1,8 @@
 //! `ictus logs`: what federates have written, merged by time.
 
 use clap::Args;
-use ictusd::api::LogLine;
+use ictusd::api::{ErrorCode, LogLine};
+use ictusd::client::Client;
 
 use crate::error::CliError;
 use crate::hosts::connect_all;
@@ -70,14 +71,7 @@ impl Logs {
         let (mut merged, mut kept) = (Merged::new(), Vec::new());
         for (host, client) in connect_all(session, &abroad.ways).await {
             let client = client?;
-            let view = client.federation(&abroad.name).await?;
-            let members = [&view.rti].into_iter().chain(&view.federates);
-            let here: Vec<_> = members.map(|it| it.name.clone()).collect();
-            let wanted_here: Vec<_> = wanted
-                .iter()
-                .filter(|it| here.contains(it))
-                .cloned()
-                .collect();
+            let wanted_here = here(&client, &abroad.name, wanted).await?;
             if !wanted.is_empty() && wanted_here.is_empty() {
                 continue;
             }
@@ -110,6 +104,33 @@ impl Logs {
             ([first, rest @ ..], _) => Ok((session.name(Some(first))?, rest)),
         }
     }
+}
+
+/// Those of the members that are, or were, on a host.
+async fn here(client: &Client, name: &str, wanted: &[String]) -> Result<Vec<String>, CliError> {
+    let view = match client.federation(name).await {
+        Ok(view) => view,
+        Err(error)
+            if error
+                .refusal()
+                .is_some_and(|it| it.code == ErrorCode::Unknown) =>
+        {
+            // It was taken down, and its logs tell whose they are.
+            let mut here = Vec::new();
+            for member in wanted {
+                let one = std::slice::from_ref(member);
+                if client.logs(name, one, false, Some(0)).await.is_ok() {
+                    here.push(member.clone());
+                }
+            }
+            return Ok(here);
+        }
+        Err(error) => return Err(error.into()),
+    };
+    let members = [&view.rti].into_iter().chain(&view.federates);
+    let members: Vec<_> = members.map(|it| &it.name).collect();
+    let wanted = wanted.iter().filter(|it| members.contains(it));
+    Ok(wanted.cloned().collect())
 }
 
 /// Prints lines in columns.
