@@ -21,6 +21,7 @@ const BOUND_S: &str = "120";
 struct World {
     sandbox: Sandbox,
     names: Vec<String>,
+    program: PathBuf,
     rti: Child,
     port: u16,
 }
@@ -33,13 +34,15 @@ impl World {
         let text = text.replace("package: .", &format!("package: {}", path.display()));
         let text = text.replacen("ictus: v1\n", &format!("ictus: v1\n{head}"), 1);
         let manifest = sandbox.manifest("diamond.yaml", &text);
-        let checked = sandbox.json(&["check", &manifest, "--set", "run=1 s"]);
-        let plan = &checked["plan"];
+        // Builds the program, too.
+        let planned = sandbox.json(&["plan", &manifest, "--set", "run=1 s"]);
+        let plan = &planned["plan"];
         fs::write(sandbox.state().join("plan.json"), plan.to_string()).unwrap();
         let federates = plan["federates"].as_array().unwrap().iter();
         let names: Vec<_> = federates
             .map(|federate| federate["name"].as_str().unwrap().to_owned())
             .collect();
+        let program = planned["executables"]["a"].as_str().unwrap();
         certify(&sandbox.state().join("tls"), &names);
         let mut rti = bounded(&ictus());
         rti.args(["rti", "-i", "x", "-n", &names.len().to_string(), "-p", "0"])
@@ -57,6 +60,7 @@ impl World {
         Self {
             sandbox,
             names,
+            program: program.into(),
             rti,
             port: u16::try_from(port).unwrap(),
         }
@@ -77,7 +81,7 @@ impl World {
     }
 
     fn program(&self) -> Command {
-        let mut program = bounded(&ictus().with_file_name("diamond"));
+        let mut program = bounded(&self.program);
         program
             .arg("--plan")
             .arg(self.sandbox.state().join("plan.json"));

@@ -18,6 +18,8 @@ use tempfile::TempDir;
 
 /// How long any one thing may take.
 pub(crate) const BOUND: Duration = Duration::from_secs(20);
+/// A daemon's own sockets: for its user, and for those who may only look.
+pub(crate) const OWN_SOCKETS: usize = 2;
 
 pub(crate) fn fakes() -> &'static Path {
     Path::new(env!("CARGO_BIN_EXE_ictusd-fakes"))
