@@ -38,7 +38,7 @@ pub(crate) enum ReachError {
     Word,
 }
 
-/// Listens, and goes on for as long as is asked.
+/// Listens, and goes on for as long as is asked, or until this host has said the word to itself.
 pub(crate) async fn listen(request: ListenRequest) -> Result<Listening, ReachError> {
     check_word(&request.word)?;
     let (tcp, udp, port) = open(&request).await?;
@@ -46,9 +46,13 @@ pub(crate) async fn listen(request: ListenRequest) -> Result<Listening, ReachErr
     let until = Instant::now() + lasting;
     let word = request.word;
     tokio::spawn(async move {
-        let (hear, echo) = (hear(&tcp, &word), echo(&udp, word.as_bytes()));
-        // It always lasts that long.
-        let _over = timeout_at(until, async { tokio::join!(hear, echo) }).await;
+        let both = async {
+            tokio::select! {
+                () = hear(&tcp, &word) => {}
+                () = echo(&udp, word.as_bytes()) => {}
+            }
+        };
+        let _over = timeout_at(until, both).await;
     });
     Ok(Listening { port })
 }
@@ -76,27 +80,36 @@ async fn open_one(address: Ipv4Addr, port: u16) -> io::Result<(TcpListener, UdpS
     Ok((tcp, UdpSocket::bind((address, port)).await?, port))
 }
 
-/// Gives the word back to everybody who connects and says it.
+/// Gives the word back to everybody who connects and says it; ends when that was this host.
 async fn hear(listener: &TcpListener, word: &str) {
     let mut callers = JoinSet::new();
     loop {
-        let Ok((mut stream, _)) = listener.accept().await else {
+        let accepted = tokio::select! {
+            accepted = listener.accept() => accepted,
+            Some(itself) = callers.join_next() => match itself {
+                Ok(true) => return,
+                Ok(false) | Err(_) => continue,
+            },
+        };
+        let Ok((mut stream, from)) = accepted else {
             return;
         };
+        let itself = stream.local_addr().is_ok_and(|here| here.ip() == from.ip());
         let word = word.to_owned();
         callers.spawn(async move {
             let answer = async {
                 let mut said = vec![0; word.len()];
                 stream.read_exact(&mut said).await?;
-                if said == word.as_bytes() {
+                let right = said == word.as_bytes();
+                if right {
                     stream.write_all(&said).await?;
                 }
-                io::Result::Ok(())
+                io::Result::Ok(right)
             };
             // Who says nothing is told nothing.
-            let _said = timeout(SAID_WITHIN, answer).await;
+            let said = timeout(SAID_WITHIN, answer).await;
+            itself && matches!(said, Ok(Ok(true)))
         });
-        while callers.try_join_next().is_some() {}
     }
 }
 
@@ -174,10 +187,11 @@ mod tests {
     use super::*;
 
     const HERE: Ipv4Addr = Ipv4Addr::LOCALHOST;
+    const ELSEWHERE: Ipv4Addr = Ipv4Addr::new(127, 0, 0, 2);
 
     async fn ask(port: u16, word: &str, limit_ms: u32) -> Reached {
         let request = ProbeRequest {
-            from: HERE,
+            from: ELSEWHERE,
             to: SocketAddrV4::new(HERE, port),
             word: word.to_owned(),
             limit_ms,
@@ -207,6 +221,22 @@ mod tests {
         let wrong = ask(there.port, "shut", 300).await;
         assert!(wrong.udp.unwrap_err().starts_with("no answer within"));
         wrong.tcp.unwrap_err();
+    }
+
+    #[tokio::test]
+    async fn a_host_that_says_the_word_to_itself_listens_no_more() {
+        let port = listen(request("open", 20_000)).await.unwrap().port;
+        let to_itself = ProbeRequest {
+            from: HERE,
+            to: SocketAddrV4::new(HERE, port),
+            word: "open".to_owned(),
+            limit_ms: 10_000,
+        };
+        probe(&to_itself).await.unwrap().tcp.unwrap();
+        // Its sockets go with its task, which is on this thread.
+        while TcpListener::bind((HERE, port)).await.is_err() {
+            tokio::task::yield_now().await;
+        }
     }
 
     #[tokio::test]

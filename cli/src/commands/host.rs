@@ -242,7 +242,11 @@ impl At {
         for name in client.names().await? {
             client.remove(&name, true).await?;
         }
-        client.end().await?;
+        if !client.end().await? {
+            let message = format!("host `{}`: somebody deploys to it", self.host);
+            return Err(CliError::new(Kind::Held, message)
+                .hint(format!("`ictus lock --host {}` shows who", self.host)));
+        }
         let connection = self.open().await;
         let connection = connection.map_err(|error| unreachable_host(&self.host, &error))?;
         boot::remove(&self.host, &connection).await?;

@@ -40,7 +40,28 @@ impl Rollout<'_> {
         }
         let tried = ways.iter().map(|way| self.try_way(way, &ports, &word));
         wrong.extend(join_all(tried).await.into_iter().flatten());
+        // So that the ports are free again.
+        let listened = ports
+            .iter()
+            .map(|(host, port)| self.end(host, *port, &word));
+        join_all(listened).await;
         Ok(wrong)
+    }
+
+    /// A host listens no more when it has said the word to itself; if that fails, it ends a little later.
+    async fn end(&self, host: &str, port: u16, word: &str) {
+        let spec = self.placement.hosts.iter().find(|it| it.name == host);
+        let (Some(client), Some(spec)) = (self.clients.get(host), spec) else {
+            return;
+        };
+        let address = self.address(spec.address);
+        let request = ProbeRequest {
+            from: address,
+            to: SocketAddrV4::new(address, port),
+            word: word.to_owned(),
+            limit_ms: PROBE_MS,
+        };
+        client.try_to_reach(&request).await.ok();
     }
 
     async fn listen<'h>(

@@ -2,7 +2,7 @@
 //!
 //! | call | answer |
 //! |---|---|
-//! | `POST /v1/reach/listen` with a [`ListenRequest`] | [`Listening`]; it ends by itself |
+//! | `POST /v1/reach/listen` with a [`ListenRequest`] | [`Listening`]; it ends by itself, or when the host has said the word to itself |
 //! | `POST /v1/reach/probe` with a [`ProbeRequest`] | [`Reached`] |
 
 use std::net::{Ipv4Addr, SocketAddrV4};

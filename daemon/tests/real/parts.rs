@@ -445,7 +445,7 @@ async fn one_host_listens_and_another_says_the_word() {
     };
     let there = one.client.listen_for_a_while(&listen).await.unwrap();
     let probe = ProbeRequest {
-        from: HOME,
+        from: Ipv4Addr::new(127, 0, 0, 2),
         to: SocketAddrV4::new(HOME, there.port),
         word,
         limit_ms: 10_000,
