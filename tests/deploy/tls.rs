@@ -59,7 +59,7 @@ fn messages_between_hosts_are_under_tls(rig: &Rig) {
     assert_eq!(answer.trim(), "21", "{answer}");
     verify(&operator, &file, "diamond", "diamond");
     let events = operator.ok(&["events", &file]);
-    assert!(events.contains("it does not speak TLS"), "{events}");
+    assert!(events.contains("the RTI refused"), "{events}");
     operator.ok(&["down", &file, "--purge"]);
     operator.leave();
 }

@@ -98,7 +98,7 @@ fn print(ui: &mut Ui, happening: &Happening, place: &str) -> Result<(), CliError
 pub(crate) fn describe(event: &Event) -> String {
     match event {
         Event::Started { member, pid, .. } => format!("{member} was started (pid {pid})"),
-        Event::Listening { port } => format!("the RTI listens on 127.0.0.1:{port}"),
+        Event::Listening { port } => format!("the RTI listens on port {port}"),
         Event::Joined {
             federate,
             joined,
