@@ -116,7 +116,7 @@ pub(crate) fn build(
         program: wanted.program.to_owned(),
     });
     let cargo = std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into());
-    let mut command = Command::new(&cargo);
+    let mut command = for_itself(&cargo);
     command
         .arg("build")
         .arg("--message-format=json")
@@ -173,6 +173,24 @@ pub(crate) fn build(
         ));
     }
     outcome.executable(wanted)
+}
+
+/// cargo, as if nobody had been run by another one.
+fn for_itself(cargo: &OsStr) -> Command {
+    let mut command = Command::new(cargo);
+    for (name, _) in std::env::vars_os() {
+        if is_of_another_package(&name) {
+            command.env_remove(name);
+        }
+    }
+    command
+}
+
+/// What cargo tells a program that it runs of that one's package. Build scripts (ring's) that ask cargo to watch these would
+/// be run again, and all that depends on them compiled again, whenever another program asks for the same build.
+fn is_of_another_package(name: &OsStr) -> bool {
+    let name = name.as_encoded_bytes();
+    name.starts_with(b"CARGO_PKG_") || name.starts_with(b"CARGO_MANIFEST_")
 }
 
 /// The triple for which cargo builds when it is not told, with the toolchain of a folder.
@@ -511,6 +529,20 @@ mod tests {
     use super::*;
 
     /// What the environment has, then what cargo is given.
+    #[test]
+    fn what_cargo_says_of_another_package_is_left_out_and_nothing_else() {
+        for (name, out) in [
+            ("CARGO_PKG_NAME", true),
+            ("CARGO_MANIFEST_DIR", true),
+            ("CARGO_HOME", false),
+            ("CARGO_TARGET_DIR", false),
+            ("CARGO_PROFILE_RELEASE_STRIP", false),
+            ("RUSTFLAGS", false),
+        ] {
+            assert_eq!(is_of_another_package(OsStr::new(name)), out, "{name}");
+        }
+    }
+
     #[test]
     fn flags_of_the_user_are_kept() {
         let own = "CARGO_TARGET_X86_64_UNKNOWN_LINUX_GNU_RUSTFLAGS";
