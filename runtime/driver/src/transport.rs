@@ -200,7 +200,7 @@ impl Connection {
         self.owed() > 0 || (has_output && self.stream.is_open())
     }
 
-    /// Has the peer's host asked often whether it is there; how long it may be silent is the [`Lookout`]'s to say.
+    /// Has the peer's host asked often whether it is there; how long it may be silent is the `Lookout`'s to say.
     pub(crate) fn watch(&self, failure_timeout: Duration) -> io::Result<()> {
         ask_often(self.stream.tcp(), failure_timeout)
     }
