@@ -11,7 +11,7 @@ use std::time::Duration;
 use ictus_deploy::Checked;
 use ictus_deploy::compose::{Compose, ComposeOptions};
 use ictusd::blobs;
-use ictusd::compose_images::LocalImages;
+use ictusd::images::Local;
 use tokio::process::Command;
 
 use crate::commands::compose::{load, of, write};
@@ -120,8 +120,9 @@ impl Stack {
 
     /// Removes its images and its directory.
     pub(crate) async fn purge(&self) -> Result<(), CliError> {
-        let engine = LocalImages::connect().await.map_err(CliError::failed)?;
-        engine.remove(&self.name).await.map_err(CliError::failed)?;
+        let engine = Local::connect().await.map_err(CliError::failed)?;
+        let removed = engine.remove_of_compose(&self.name).await;
+        removed.map_err(CliError::failed)?;
         match fs::remove_dir_all(&self.directory) {
             Err(error) if error.kind() != std::io::ErrorKind::NotFound => {
                 let message = format!("cannot remove {}: {error}", self.directory.display());

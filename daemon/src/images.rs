@@ -1,4 +1,4 @@
-//! Images of the engine of whoever deploys: found, built, and cut down to what a host does not have.
+//! Images of the engine of whoever deploys: found, built, loaded, and cut down to what a host does not have.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs::File;
@@ -7,9 +7,11 @@ use std::path::{Path, PathBuf};
 
 use futures_util::{StreamExt, stream};
 use hyper::body::Bytes;
+use ictus_deploy::compose::image::LABEL;
+use ictus_deploy::image::Archive;
 use ictus_deploy::image::elf::Architecture;
 use serde::{Deserialize, Serialize};
-use tar::{Archive, Builder, EntryType, Header};
+use tar::{Builder, EntryType, Header};
 use tempfile::NamedTempFile;
 use tokio::sync::mpsc;
 
@@ -89,6 +91,31 @@ impl Local {
     /// When the engine does not tell.
     pub async fn find(&self, image: &str) -> Result<Option<Found>, ImagesError> {
         Ok(self.0.inspect_image(image).await?.map(found))
+    }
+
+    /// Loads an image under its name, unless that very one has the name already; gives whether it was loaded. The image
+    /// that had the name before goes when nothing uses it.
+    ///
+    /// # Errors
+    /// When the engine does not take it.
+    pub async fn load(&self, archive: Archive) -> Result<bool, ImagesError> {
+        let before = self.find(&archive.reference()).await?.map(|image| image.id);
+        if before.as_deref() == Some(archive.id()) {
+            return Ok(false);
+        }
+        let now = self.0.load(archive).await?;
+        if let Some(before) = before.filter(|before| *before != now) {
+            self.0.remove_unused_image(&before).await?;
+        }
+        Ok(true)
+    }
+
+    /// Removes the images of a federation's compose file that nothing uses; gives how many.
+    ///
+    /// # Errors
+    /// When the engine does not tell which there are, or refuses one for another reason than that it is used.
+    pub async fn remove_of_compose(&self, federation: &str) -> Result<usize, ImagesError> {
+        Ok(self.0.remove_images((LABEL, federation)).await?)
     }
 
     /// Builds the image of a folder's Dockerfile, and gives it a name.
@@ -298,7 +325,7 @@ struct Contents {
 impl Contents {
     fn of(archive: File) -> io::Result<Self> {
         let mut contents = Self::default();
-        for entry in Archive::new(archive).entries()? {
+        for entry in tar::Archive::new(archive).entries()? {
             let entry = entry?;
             let path = plain(&entry.path()?);
             match entry.link_name()? {
@@ -454,7 +481,7 @@ mod tests {
         let mut out = Vec::new();
         let only = BTreeSet::from([id(top)]);
         saved.write_to("name:1", &only, &mut out).unwrap();
-        let mut archive = Archive::new(out.as_slice());
+        let mut archive = tar::Archive::new(out.as_slice());
         let mut files = BTreeMap::new();
         for entry in archive.entries().unwrap() {
             let mut entry = entry.unwrap();

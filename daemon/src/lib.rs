@@ -12,7 +12,6 @@ pub mod api;
 pub mod blobs;
 pub mod client;
 pub mod collector;
-pub mod compose_images;
 pub mod daemon;
 mod docker;
 mod facts;

@@ -1,11 +1,15 @@
 //! `ictus compose`: a federation of one host for docker-compose, without a daemon.
 
+use std::fs;
+use std::io::{self, Write};
+use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 
 use clap::Args;
 use ictus_deploy::compose::{Compose, ComposeError, ComposeOptions};
 use ictus_deploy::{CheckOptions, Checked};
 use serde_json::json;
+use tempfile::Builder;
 
 use crate::args::ManifestArgs;
 use crate::error::{CliError, Kind};
@@ -46,7 +50,7 @@ impl ComposeCommand {
             monitoring: self.monitoring,
             trace: self.trace.clone(),
         };
-        let compose = Compose::of(&checked, &options).map_err(refused)?;
+        let compose = of(&checked, &options)?;
         if self.build {
             let session = Session::new()?;
             session.block_on(load(ui, &compose))?;
@@ -76,7 +80,7 @@ pub(crate) fn of(checked: &Checked, options: &ComposeOptions) -> Result<Compose,
 /// Makes the images that are not in the engine yet, and loads them.
 pub(crate) async fn load(ui: &mut Ui, compose: &Compose) -> Result<(), CliError> {
     let ictus = std::env::current_exe().map_err(CliError::failed)?;
-    let engine = ictusd::compose_images::LocalImages::connect().await;
+    let engine = ictusd::images::Local::connect().await;
     let engine = engine.map_err(CliError::failed)?;
     for image in &compose.images {
         ui.progress("loading", &image.reference);
@@ -96,11 +100,15 @@ pub(crate) async fn load(ui: &mut Ui, compose: &Compose) -> Result<(), CliError>
 
 /// Writes a file whole or not at all.
 pub(crate) fn write(path: &Path, text: &str) -> Result<(), CliError> {
-    let failed = |error| CliError::failed(format!("cannot write {}: {error}", path.display()));
-    let mut temporary = path.as_os_str().to_owned();
-    temporary.push(".tmp");
-    std::fs::write(&temporary, text).map_err(failed)?;
-    std::fs::rename(&temporary, path).map_err(failed)
+    let parent = path.parent().filter(|it| !it.as_os_str().is_empty());
+    let written = || -> io::Result<()> {
+        let mut file = Builder::new()
+            .permissions(fs::Permissions::from_mode(0o666))
+            .tempfile_in(parent.unwrap_or(Path::new(".")))?;
+        file.write_all(text.as_bytes())?;
+        Ok(file.persist(path).map(drop)?)
+    };
+    written().map_err(|error| CliError::failed(format!("cannot write {}: {error}", path.display())))
 }
 
 fn refused(error: ComposeError) -> CliError {

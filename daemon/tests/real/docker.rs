@@ -150,11 +150,13 @@ impl Rig {
 
 impl Drop for Rig {
     fn drop(&mut self) {
+        // What a daemon that just ended had asked to be removed may still be going.
+        let remove = |args: &[&str]| Command::new("docker").args(args).output().ok();
         for id in self.ids() {
-            docker(&["rm", "--force", &id]);
+            remove(&["rm", "--force", &id]);
         }
         for id in self.images() {
-            docker(&["rmi", "--force", &id]);
+            remove(&["rmi", "--force", &id]);
         }
     }
 }
