@@ -22,6 +22,11 @@ pub struct Account {
 }
 
 impl Account {
+    /// `UID:GID`, which every container understands.
+    pub(crate) fn numbers(&self) -> String {
+        format!("{}:{}", self.uid, self.gid)
+    }
+
     /// Gives it a pipe, so that it may open it again by `/proc/self/fd`.
     pub(crate) fn own(&self, pipe: impl AsFd) -> io::Result<()> {
         let (uid, gid) = (Uid::from_raw(self.uid), Gid::from_raw(self.gid));
@@ -36,6 +41,21 @@ impl Account {
 pub(crate) fn find(user: &str) -> Result<Account, String> {
     let read = |path| fs::read_to_string(path).unwrap_or_default();
     resolve(user, &read("/etc/passwd"), &read("/etc/group"))
+}
+
+/// The number of a group of this host, if there is such a one.
+pub(crate) fn group(name: &str) -> Option<u32> {
+    let text = fs::read_to_string("/etc/group").ok()?;
+    let found = lines(&text).find(|line| line[0] == name);
+    found?[2].parse().ok()
+}
+
+/// The name of a user of this host, or its number.
+pub(crate) fn name(uid: u32) -> String {
+    let text = fs::read_to_string("/etc/passwd").unwrap_or_default();
+    let uid = uid.to_string();
+    let found = lines(&text).find(|line| line[2] == uid);
+    found.map_or_else(|| uid.clone(), |line| line[0].to_owned())
 }
 
 /// `UID`, `UID:GID`, or names, as in these files; a number need not stand there, but then its group has to be said.

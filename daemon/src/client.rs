@@ -5,6 +5,7 @@ use std::fmt;
 use std::fs::OpenOptions;
 use std::io;
 use std::marker::PhantomData;
+use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
 use std::pin::Pin;
 use std::process::Stdio;
@@ -22,12 +23,14 @@ use tokio::net::UnixStream;
 use tokio::task::JoinHandle;
 use tokio::time::timeout;
 
+use crate::accounts;
 use crate::api::secret::{SecretValues, StartCall};
 use crate::api::{
     ApiError, ErrorCode, FederationMeasures, FederationView, Happening, Info, LogLine, Removed,
     StartRequest,
 };
 use crate::daemon::READY;
+use crate::installation::{GROUP, PROGRAM};
 use crate::paths::{Paths, PathsError};
 use crate::process;
 
@@ -84,6 +87,20 @@ pub enum ClientError {
         /// Its log.
         log: PathBuf,
     },
+    /// The host's daemon is not for this user. Become a member of its group.
+    #[error(
+        "user {user} may not use the ictusd of this host: have root run `usermod -aG {GROUP} {user}` there, and log in again"
+    )]
+    NotMember {
+        /// Who asked.
+        user: String,
+    },
+    /// The host's daemon does not run, and this user may not start it.
+    #[error(
+        "the ictusd of this host does not run, and only root may start it: `sudo systemctl start ictusd`, or where there is \
+         no systemd `sudo {PROGRAM} dial-stdio </dev/null`"
+    )]
+    NotServing,
     /// The daemon is not there, or went away.
     #[error("no connection to the daemon at {socket}", socket = socket.display())]
     Unreachable {
@@ -123,6 +140,8 @@ impl ClientError {
             Self::Refused(error) => Some(error),
             Self::Paths(_)
             | Self::NotStarted { .. }
+            | Self::NotMember { .. }
+            | Self::NotServing
             | Self::Unreachable { .. }
             | Self::Silent { .. }
             | Self::Broken(_)
@@ -178,13 +197,24 @@ impl Client {
         if let Some(client) = Self::probe(paths).await? {
             return Ok(client);
         }
+        let user = rustix::process::geteuid();
+        if paths.of_host() && !user.is_root() {
+            let refused = UnixStream::connect(paths.socket()).await.err();
+            return Err(match refused.map(|error| error.kind()) {
+                Some(io::ErrorKind::PermissionDenied) => ClientError::NotMember {
+                    user: accounts::name(user.as_raw()),
+                },
+                Some(_) | None => ClientError::NotServing,
+            });
+        }
         paths.create()?;
         let log = paths.daemon_log();
         let failed = |why: String| ClientError::NotStarted {
             why,
             log: paths.daemon_log(),
         };
-        let file = OpenOptions::new().append(true).create(true).open(&log);
+        let mut options = OpenOptions::new();
+        let file = options.append(true).create(true).mode(0o600).open(&log);
         let file = file.map_err(|error| failed(error.to_string()))?;
         let length_before = file.metadata().map_or(0, |found| found.len());
         let mut command = tokio::process::Command::new(executable);

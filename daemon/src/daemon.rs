@@ -8,14 +8,15 @@ use std::os::unix::net::UnixStream;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use rustix::fs::{FlockOperation, flock};
+use rustix::fs::{FlockOperation, Mode, flock};
 use tokio::net::UnixListener;
 use tokio::signal::unix::{SignalKind, signal};
 
 use crate::files;
 use crate::host::Host;
-use crate::paths::{Paths, PathsError};
-use crate::server::{OwnListener, router, viewer};
+use crate::installation::{ConfigError, Shared};
+use crate::paths::{Owner, Paths, PathsError};
+use crate::server::{OwnListener, callers, router, viewer};
 
 /// What a daemon prints on standard output once it, or another one, serves.
 pub const READY: &str = "ready";
@@ -36,6 +37,9 @@ pub enum DaemonError {
     /// It has no place.
     #[error(transparent)]
     Paths(#[from] PathsError),
+    /// What the owner of the host has decided cannot be gone by.
+    #[error(transparent)]
+    Config(#[from] ConfigError),
     /// Another one holds the lock but does not answer. Wait, or end it.
     #[error("another daemon holds {lock} and does not answer", lock = lock.display())]
     Locked {
@@ -68,6 +72,13 @@ pub enum Served {
 pub fn run(paths: &Paths) -> Result<Served, DaemonError> {
     // Fails only for a group leader, which a shell makes of us; a Ctrl-C there is meant for us.
     rustix::process::setsid().ok();
+    let mut paths = paths.clone();
+    if paths.of_host() {
+        paths.owner = Owner::Host(Some(Shared::read()?));
+        // Others may enter its directories; what they may read is opened to them by name.
+        rustix::process::umask(Mode::from_raw_mode(0o077));
+    }
+    let paths = &paths;
     paths.create()?;
     let Some(lock) = Lock::acquire(paths)? else {
         announce()?;
@@ -101,8 +112,8 @@ pub fn log_to_stderr() {
 }
 
 async fn serve(paths: &Paths) -> Result<(), DaemonError> {
-    let listener = bind(&paths.socket())?;
-    let viewers = bind(&paths.viewer_socket())?;
+    let listener = bind(paths, &paths.socket())?;
+    let viewers = bind(paths, &paths.viewer_socket())?;
     let mut terminate = signal(SignalKind::terminate()).map_err(system("watch signals"))?;
     let mut interrupt = signal(SignalKind::interrupt()).map_err(system("watch signals"))?;
     let host = Host::new(paths.clone());
@@ -110,14 +121,15 @@ async fn serve(paths: &Paths) -> Result<(), DaemonError> {
     announce()?;
     tracing::info!(socket = %paths.socket().display(), "serving");
     let (end, ended) = tokio::sync::oneshot::channel::<()>();
-    let server = axum::serve(OwnListener(listener), router(host.clone()))
+    let listen = |listener| OwnListener::new(listener, paths);
+    let server = axum::serve(listen(listener), callers(router(host.clone())))
         .with_graceful_shutdown(async move { ended.await.unwrap_or(()) });
     let server = tokio::spawn(server.into_future());
     // Who only looks is not waited for at the end.
-    let viewers = axum::serve(OwnListener(viewers), viewer::router(host.clone()));
+    let viewers = axum::serve(listen(viewers), callers(viewer::router(host.clone())));
     let viewers = tokio::spawn(viewers.into_future());
     tokio::select! {
-        () = idle(&host, idle_after()) => tracing::info!("nothing owned"),
+        () = idle(&host, idle_after()), if !paths.of_host() => tracing::info!("nothing owned"),
         () = host.ended() => tracing::info!("asked to end"),
         _ = terminate.recv() => tracing::info!("SIGTERM"),
         _ = interrupt.recv() => tracing::info!("SIGINT"),
@@ -129,9 +141,12 @@ async fn serve(paths: &Paths) -> Result<(), DaemonError> {
 }
 
 /// Listens; we hold the lock, so a socket that is there is a dead daemon's.
-fn bind(path: &Path) -> Result<UnixListener, DaemonError> {
+fn bind(paths: &Paths, path: &Path) -> Result<UnixListener, DaemonError> {
     files::remove(path).map_err(system("remove a stale socket"))?;
-    UnixListener::bind(path).map_err(system("bind the socket"))
+    let listener = UnixListener::bind(path).map_err(system("bind the socket"))?;
+    let admitted = paths.admit_group(path, 0o660);
+    admitted.map_err(system("let the group come to the socket"))?;
+    Ok(listener)
 }
 
 fn idle_after() -> Duration {

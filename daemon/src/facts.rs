@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 
 use ictus_deploy::gives::Gives;
 
+use crate::accounts;
 use crate::api::part::{DockerFacts, HostFacts};
 use crate::paths::Paths;
 
@@ -28,7 +29,10 @@ pub(crate) fn of_this_host(paths: &Paths, docker: Result<DockerFacts, String>) -
         state: paths.state.clone(),
         gives: gives(paths),
         docker,
-        starts_at_boot: starts_at_boot(),
+        starts_at_boot: starts_at_boot(paths),
+        run_as: paths
+            .shared()
+            .map(|shared| accounts::name(shared.run_as.uid)),
     }
 }
 
@@ -37,22 +41,18 @@ pub(crate) fn gives(paths: &Paths) -> Gives {
     gives::of_this_host(paths, &user())
 }
 
-/// Whether systemd has been told to start the user's unit, and to do so while nobody is logged in.
-fn starts_at_boot() -> bool {
+/// Whether systemd has been told to start the host's unit; or the user's, and to do so while nobody is logged in.
+fn starts_at_boot(paths: &Paths) -> bool {
+    if paths.of_host() {
+        let wanted = "/etc/systemd/system/multi-user.target.wants/ictusd.service";
+        return fs::symlink_metadata(wanted).is_ok();
+    }
     let wanted = ".config/systemd/user/default.target.wants/ictusd.service";
     let home = std::env::var_os("HOME").map(PathBuf::from);
     let enabled = home.is_some_and(|home| fs::symlink_metadata(home.join(wanted)).is_ok());
     enabled && Path::new("/var/lib/systemd/linger").join(user()).exists()
 }
 
-/// The user's name; its number when there is none.
 fn user() -> String {
-    let uid = rustix::process::geteuid().as_raw().to_string();
-    let passwd = fs::read_to_string("/etc/passwd").unwrap_or_default();
-    let mut lines = passwd.lines().map(|line| line.split(':'));
-    let name = lines.find_map(|mut fields| {
-        let name = fields.next()?;
-        (fields.nth(1)? == uid).then(|| name.to_owned())
-    });
-    name.unwrap_or(uid)
+    accounts::name(rustix::process::geteuid().as_raw())
 }

@@ -399,8 +399,11 @@ impl Federation {
                 request: &self.request,
                 record: &self.record,
             };
-            let spec = launch::spec(&run, (member, rti_port), &supervised);
-            self.link(member, &name, &supervised, Origin::Launch(Box::new(spec)));
+            let origin = match launch::spec(&run, (member, rti_port), &supervised) {
+                Ok(spec) => Origin::Launch(Box::new(spec)),
+                Err(error) => Origin::Refused(error.message),
+            };
+            self.link(member, &name, &supervised, origin);
         }
     }
 

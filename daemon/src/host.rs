@@ -29,7 +29,7 @@ mod needs;
 mod parts;
 mod recorded;
 
-pub(crate) use needs::account;
+pub(crate) use needs::{account, unnamed};
 
 /// Events that a slow follower may miss before it is disconnected.
 const EVENTS_MAX: usize = 4096;

@@ -21,6 +21,7 @@ mod history;
 mod host;
 pub mod identity;
 pub mod images;
+pub mod installation;
 mod leases;
 pub mod logs;
 mod metrics;

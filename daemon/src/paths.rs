@@ -7,18 +7,34 @@ use std::os::unix::ffi::{OsStrExt, OsStringExt};
 use std::os::unix::fs::{DirBuilderExt, MetadataExt, PermissionsExt};
 use std::path::{Path, PathBuf};
 
+use rustix::fs::Gid;
+
+use crate::accounts;
+use crate::installation::{self, Shared};
+
 /// The longest socket path the kernel takes: `sun_path` has 108 bytes, the last one a zero.
 const SOCKET_PATH_BYTES_MAX: usize = 107;
 /// The longest name of a socket in the run directory: `/`, 32 hexadecimal digits, `.sock`.
 const SOCKET_NAME_BYTES_MAX: usize = 38;
 
-/// The two directories of one user's daemon.
+/// The two directories of a daemon: of one user's, or of the whole host's.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Paths {
     /// Records and logs; survives reboots.
     pub state: PathBuf,
-    /// Sockets; private (mode 0700).
+    /// Sockets; private (mode 0700), of the whole host's for its group (0750).
     pub run: PathBuf,
+    /// Whose they are.
+    pub owner: Owner,
+}
+
+/// Whose daemon it is.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Owner {
+    /// The user's who runs it.
+    User,
+    /// The whole host's; what its owner has decided is known once it serves.
+    Host(Option<Shared>),
 }
 
 /// Why the daemon has no place.
@@ -63,11 +79,19 @@ pub enum PathsError {
 }
 
 impl Paths {
-    /// Takes the directories from `ICTUS_STATE_DIR`, `XDG_STATE_HOME`, `XDG_RUNTIME_DIR` and `HOME`.
+    /// Those of the whole host, for a program of that installation; otherwise what `ICTUS_STATE_DIR`, `XDG_STATE_HOME`,
+    /// `XDG_RUNTIME_DIR` and `HOME` say.
     ///
     /// # Errors
     /// See [`PathsError`].
     pub fn from_env() -> Result<Self, PathsError> {
+        if std::env::current_exe().is_ok_and(|program| installation::has(&program)) {
+            return Ok(Self {
+                state: installation::STATE.into(),
+                run: installation::RUN.into(),
+                owner: Owner::Host(None),
+            });
+        }
         Self::from_variables(|name| std::env::var_os(name).filter(|value| !value.is_empty()))
     }
 
@@ -81,6 +105,7 @@ impl Paths {
             Self {
                 run: state.join("run"),
                 state,
+                owner: Owner::User,
             }
         } else {
             let home = variable("HOME").map(|home| PathBuf::from(home).join(".local/state"));
@@ -88,7 +113,8 @@ impl Paths {
             let state = home.ok_or(PathsError::NoHome)?.join("ictus");
             let run = variable("XDG_RUNTIME_DIR")
                 .map_or_else(|| state.join("run"), |run| PathBuf::from(run).join("ictus"));
-            Self { state, run }
+            let owner = Owner::User;
+            Self { state, run, owner }
         };
         paths.checked()
     }
@@ -109,7 +135,22 @@ impl Paths {
         Ok(self)
     }
 
-    /// Makes both directories; the run directory is private to this user.
+    /// Whether the daemon is the whole host's.
+    #[must_use]
+    pub fn of_host(&self) -> bool {
+        matches!(self.owner, Owner::Host(_))
+    }
+
+    /// What the owner of the host has decided; absent for a user's own daemon, and for who only asks.
+    #[must_use]
+    pub fn shared(&self) -> Option<&Shared> {
+        match &self.owner {
+            Owner::Host(shared) => shared.as_ref(),
+            Owner::User => None,
+        }
+    }
+
+    /// Makes both directories; the run directory is private to this user, or to the host's group.
     ///
     /// # Errors
     /// When one cannot be made, or the run directory is somebody else's.
@@ -134,11 +175,23 @@ impl Paths {
                 uid: found.uid(),
             });
         }
-        if found.mode() & 0o077 != 0 {
+        if !self.of_host() && found.mode() & 0o077 != 0 {
             fs::set_permissions(&self.run, Permissions::from_mode(0o700))
                 .map_err(unusable(&self.run))?;
         }
-        Ok(())
+        self.admit_group(&self.run, 0o750)
+            .map_err(unusable(&self.run))
+    }
+
+    /// Lets the host's group come to one of our own; does nothing for a user's daemon.
+    pub(crate) fn admit_group(&self, path: &Path, mode: u32) -> io::Result<()> {
+        let group = accounts::group(installation::GROUP);
+        let Some(group) = group.filter(|_| self.of_host()) else {
+            return Ok(());
+        };
+        // Group first: nobody else's is let in meanwhile.
+        rustix::fs::chown(path, None, Some(Gid::from_raw(group)))?;
+        fs::set_permissions(path, Permissions::from_mode(mode))
     }
 
     /// The daemon's socket.

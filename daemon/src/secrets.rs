@@ -394,6 +394,7 @@ mod tests {
         Paths {
             state: directory.path().to_path_buf(),
             run: directory.path().join("run"),
+            owner: crate::paths::Owner::User,
         }
     }
 

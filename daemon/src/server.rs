@@ -8,17 +8,20 @@ use std::time::Duration;
 
 use axum::Router;
 use axum::body::{Body, Bytes};
+use axum::extract::connect_info::{Connected, IntoMakeServiceWithConnectInfo};
 use axum::extract::{DefaultBodyLimit, Path, Query, Request, State};
 use axum::http::StatusCode;
 use axum::http::header::CONTENT_TYPE;
 use axum::middleware::{Next, from_fn_with_state};
 use axum::response::{IntoResponse, Json, Response};
 use axum::routing::{get, post};
+use axum::serve::IncomingStream;
 use hyper::body::Frame;
 use serde::{Deserialize, Serialize};
 use tokio::net::{UnixListener, UnixStream};
 use tokio::sync::{broadcast, mpsc, watch};
 
+use crate::accounts;
 use crate::api::secret::StartCall;
 use crate::api::{
     ApiError, ErrorCode, Event, FederationMeasures, FederationView, Happening, Info, LogLine,
@@ -27,6 +30,7 @@ use crate::api::{
 use crate::federation::Command;
 use crate::host::Host;
 use crate::logs::Follower;
+use crate::paths::Paths;
 use crate::store::Leave;
 
 mod parts;
@@ -74,21 +78,30 @@ pub(crate) fn router(host: Host) -> Router {
         .with_state(host)
 }
 
-/// Accepts connections of this user only.
+/// Accepts connections of this user only; of the host's daemon, of whoever may open the socket.
 #[derive(Debug)]
-pub(crate) struct OwnListener(pub(crate) UnixListener);
+pub(crate) struct OwnListener {
+    listener: UnixListener,
+    of_host: bool,
+}
+
+impl OwnListener {
+    pub(crate) fn new(listener: UnixListener, paths: &Paths) -> Self {
+        let of_host = paths.of_host();
+        Self { listener, of_host }
+    }
+}
 
 impl axum::serve::Listener for OwnListener {
     type Io = UnixStream;
-    type Addr = tokio::net::unix::SocketAddr;
+    type Addr = Caller;
 
     async fn accept(&mut self) -> (Self::Io, Self::Addr) {
-        let own = rustix::process::geteuid().as_raw();
         loop {
-            match self.0.accept().await {
-                Ok((stream, address)) => match stream.peer_cred() {
-                    Ok(peer) if peer.uid() == own => return (stream, address),
-                    Ok(peer) => tracing::warn!(uid = peer.uid(), "another user was refused"),
+            match self.listener.accept().await {
+                Ok((stream, _)) => match stream.peer_cred().map(|peer| Caller(peer.uid())) {
+                    Ok(caller) if self.of_host || caller.is_us() => return (stream, caller),
+                    Ok(Caller(uid)) => tracing::warn!(uid, "another user was refused"),
                     Err(error) => tracing::warn!(%error, "a nameless peer was refused"),
                 },
                 Err(error) => {
@@ -100,8 +113,37 @@ impl axum::serve::Listener for OwnListener {
     }
 
     fn local_addr(&self) -> io::Result<Self::Addr> {
-        self.0.local_addr()
+        Ok(Caller(rustix::process::geteuid().as_raw()))
     }
+}
+
+/// The user at the other end, as the kernel tells.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct Caller(u32);
+
+impl Caller {
+    fn is_us(self) -> bool {
+        self.0 == rustix::process::geteuid().as_raw()
+    }
+
+    /// Who somebody is: what another user than the daemon's says of itself comes after what is known.
+    fn named(self, says: String) -> String {
+        if self.is_us() {
+            return says;
+        }
+        format!("{} ({says})", accounts::name(self.0))
+    }
+}
+
+impl Connected<IncomingStream<'_, OwnListener>> for Caller {
+    fn connect_info(stream: IncomingStream<'_, OwnListener>) -> Self {
+        *stream.remote_addr()
+    }
+}
+
+/// Routes that know who calls.
+pub(crate) fn callers(router: Router) -> IntoMakeServiceWithConnectInfo<Router, Caller> {
+    router.into_make_service_with_connect_info()
 }
 
 async fn touch(State(host): State<Host>, request: Request, next: Next) -> Response {
@@ -546,5 +588,21 @@ impl IntoResponse for ApiError {
             ErrorCode::Failed => StatusCode::INTERNAL_SERVER_ERROR,
         };
         (status, Json(self)).into_response()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::Caller;
+
+    /// What the kernel tells comes before what somebody says of itself.
+    #[test]
+    fn another_user_is_named_by_the_system() {
+        let own = rustix::process::geteuid().as_raw();
+        let says = || "ann@laptop".to_owned();
+        assert_eq!(Caller(own).named(says()), "ann@laptop");
+        let stranger = own.wrapping_add(987_654);
+        let named = Caller(stranger).named(says());
+        assert_eq!(named, format!("{stranger} (ann@laptop)"));
     }
 }

@@ -23,6 +23,8 @@ pub struct Gives {
     pub lock_memory: Result<(), Denied>,
     /// The tmpfs directory in which federates find their secrets.
     pub secrets: Result<PathBuf, Denied>,
+    /// Whether no federate may be root, though the daemon is.
+    pub refuses_root: bool,
 }
 
 /// Why a host does not give something.
@@ -57,6 +59,7 @@ impl Default for Gives {
             realtime_contained: Err(denied.clone()),
             lock_memory: Err(denied.clone()),
             secrets: Err(denied),
+            refuses_root: false,
         }
     }
 }
@@ -100,6 +103,10 @@ impl Gives {
         let user = needs.user.as_deref()?;
         let number: Option<u32> = user.split(':').next()?.parse().ok();
         let own = number == Some(self.uid);
+        let root = number == Some(0) || user.split(':').next() == Some("root");
+        if root && self.refuses_root {
+            return Some(self.no_root(user));
+        }
         let (what, fix) = match engine {
             Engine::Process if self.uid == 0 || (own && !user.contains(':')) => return None,
             Engine::Process => (
@@ -125,6 +132,16 @@ impl Gives {
         };
         let fix = fix.to_owned();
         Some(Lack { what, fix })
+    }
+
+    /// That a user who is root is refused.
+    #[must_use]
+    pub fn no_root(&self, user: &str) -> Lack {
+        Lack {
+            what: format!("user `{user}`: the host's owner lets no federate be root"),
+            fix: "leave `user` out, or write `allow_root = true` into /etc/ictus/ictusd.toml there and start its ictusd again"
+                .to_owned(),
+        }
     }
 
     fn realtime(&self, engine: Engine, needs: &Needs) -> Vec<Lack> {
@@ -206,6 +223,7 @@ mod tests {
             realtime_contained: Err(denied("no budget")),
             lock_memory: Err(denied("little")),
             secrets: Ok("/dev/shm/x".into()),
+            refuses_root: false,
         }
     }
 
@@ -303,6 +321,16 @@ mod tests {
             let lacks = gives(*uid).lacks(*engine, needs);
             let found: Vec<_> = lacks.iter().map(|lack| lack.what.as_str()).collect();
             assert_eq!(&found, expected, "{engine:?} {needs:?}");
+        }
+        let owned = Gives {
+            refuses_root: true,
+            ..gives(0)
+        };
+        for (name, refused) in [("root", true), ("0:7", true), ("bob", false), ("7", false)] {
+            for engine in [process, docker] {
+                let lacks = owned.lacks(engine, &user(name, false));
+                assert_eq!(!lacks.is_empty(), refused, "{engine:?} {name}");
+            }
         }
         let none = Gives {
             secrets: Err(denied("no tmpfs")),

@@ -12,6 +12,7 @@ mod network;
 mod operator;
 mod rows;
 mod secrets;
+mod system;
 mod tls;
 mod verbs;
 
@@ -37,6 +38,7 @@ const SCENARIOS: &[&[Scenario]] = &[
     images::SCENARIOS,
     losses::SCENARIOS,
     tls::SCENARIOS,
+    system::SCENARIOS,
     verbs::SCENARIOS,
 ];
 

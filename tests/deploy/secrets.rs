@@ -36,11 +36,11 @@ pub(crate) const SCENARIOS: &[Scenario] = &[
 ];
 
 /// Values that stand nowhere else, of the same length.
-const CANARY: &str = "zzq-canary-7f3ad1c96e08";
+pub(crate) const CANARY: &str = "zzq-canary-7f3ad1c96e08";
 const OTHER: &str = "zzq-second-0b52e8d4f71c";
 
 /// `keeper` on the second host has a secret, `counter` on the first hears from it.
-fn manifest(operator: &Operator<'_>, engine: &str, secret: &str) -> String {
+pub(crate) fn manifest(operator: &Operator<'_>, engine: &str, secret: &str) -> String {
     let text = format!(
         "ictus: v1\nfederation: kept\n{}programs:\n  canary: {{ package: {} }}\nfederates:\n  \
          keeper: {{ host: h2, class: Keeper, parameters: {{ bytes: {} }}, secrets: [{secret}] }}\n  \
@@ -53,7 +53,7 @@ fn manifest(operator: &Operator<'_>, engine: &str, secret: &str) -> String {
     operator.manifest("kept.yaml", &text)
 }
 
-const FROM_FILE: &str = "{ name: TOKEN, file: token }";
+pub(crate) const FROM_FILE: &str = "{ name: TOKEN, file: token }";
 
 /// Where values are on a host: files (those of the engine's images and logs among them), arguments and environments of
 /// all processes, what the engine tells of containers, and images. The values are in no argument and no file of the search.

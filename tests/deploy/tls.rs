@@ -20,7 +20,7 @@ pub(crate) const SCENARIOS: &[Scenario] = &[
 ];
 
 /// The diamond over all hosts, which says nothing of `security`.
-fn diamond(operator: &Operator<'_>, head: &str, more: &str) -> String {
+pub(crate) fn diamond(operator: &Operator<'_>, head: &str, more: &str) -> String {
     let hosts = hosts(operator.rig, more).replace("security: trusted-network\n", "");
     let text = spread(operator.rig, "diamond", &format!("{head}{hosts}"));
     assert!(!text.contains("security"), "{text}");

@@ -20,6 +20,7 @@ use crate::ui::{Table, Ui};
 
 mod boot;
 mod keys;
+mod system;
 
 /// What an upgrade sends and keeps while it is under way.
 const INSTALLED_NEW: &str = ".local/share/ictus/bin/ictusd.new";
@@ -56,8 +57,12 @@ enum What {
     Upgrade(Upgrade),
     /// Remove ictusd and all that it kept; refused while something runs
     Rm(At),
-    /// Print the systemd unit that `add --at-boot` installs
-    Unit,
+    /// Print the systemd unit that `add` installs
+    Unit {
+        /// That of `add --system`, not that of `add --at-boot`
+        #[arg(long)]
+        system: bool,
+    },
 }
 
 #[derive(Debug, Args)]
@@ -85,6 +90,10 @@ struct Add {
     /// Have systemd start ictusd there, also while nobody is logged in (a unit of the user's own)
     #[arg(long)]
     at_boot: bool,
+    /// Install it for the whole host, as root's (or by `sudo`): whoever is in its group `ictus` may use it, which are
+    /// root's rights, and federates are a user of their own
+    #[arg(long, conflicts_with = "at_boot")]
+    system: bool,
 }
 
 #[derive(Debug, Args)]
@@ -106,7 +115,10 @@ impl Host {
                 What::Upgrade(upgrade) => upgrade.run(ui, &session).await,
                 What::Rm(at) => at.remove(ui, &session).await,
                 What::Ls => list(ui, &session),
-                What::Unit => ui.result(&boot::UNIT, || boot::UNIT.to_owned()),
+                What::Unit { system } => {
+                    let unit = if *system { system::UNIT } else { boot::UNIT };
+                    ui.result(&unit, || unit.to_owned())
+                }
             }
         })
     }
@@ -127,7 +139,11 @@ impl Add {
             ui.message(remark);
         }
         let own = std::env::current_exe().map_err(CliError::failed)?;
-        install(ui, &at.host, (&connection, &own, INSTALLED)).await?;
+        if self.system {
+            system::install(ui, (&at.host, &connection), &own).await?;
+        } else {
+            install(ui, &at.host, (&connection, &own, INSTALLED)).await?;
+        }
         if self.at_boot {
             // The unit's is the one that is to serve.
             at.daemon(session).await?.give_way().await?;
@@ -228,6 +244,12 @@ impl At {
 
     async fn remove(&self, ui: &mut Ui, session: &Session) -> Result<(), CliError> {
         let client = self.daemon(session).await?;
+        let connection = self.open().await;
+        let connection = connection.map_err(|error| unreachable_host(&self.host, &error))?;
+        let root = match client.host().await?.run_as {
+            Some(_) => Some(system::Root::of(&self.host, &connection).await?),
+            None => None,
+        };
         let names: Vec<_> = client
             .federations()
             .await?
@@ -247,15 +269,17 @@ impl At {
             return Err(CliError::new(Kind::Held, message)
                 .hint(format!("`ictus lock --host {}` shows who", self.host)));
         }
-        let connection = self.open().await;
-        let connection = connection.map_err(|error| unreachable_host(&self.host, &error))?;
-        boot::remove(&self.host, &connection).await?;
-        for program in [INSTALLED, INSTALLED_NEW, INSTALLED_OLD] {
-            run(&self.host, &connection, &["rm", "-f", program]).await?;
-        }
-        for directory in DIRECTORIES {
-            // What somebody else put there stays.
-            connection.run(&["rmdir", directory], &[]).await.ok();
+        if let Some(root) = root {
+            system::remove(&root).await?;
+        } else {
+            boot::remove(&self.host, &connection).await?;
+            for program in [INSTALLED, INSTALLED_NEW, INSTALLED_OLD] {
+                run(&self.host, &connection, &["rm", "-f", program]).await?;
+            }
+            for directory in DIRECTORIES {
+                // What somebody else put there stays.
+                connection.run(&["rmdir", directory], &[]).await.ok();
+            }
         }
         known::change(&session.paths.state, |known| drop(known.remove(&self.host)))?;
         ui.stage("removed", &format!("{}: ictusd", self.host));
@@ -271,23 +295,39 @@ impl Upgrade {
         let connection = connection.map_err(|error| unreachable_host(&at.host, &error))?;
         let own = std::env::current_exe().map_err(CliError::failed)?;
         let program = self.program.as_deref().unwrap_or(&own);
-        install(ui, &at.host, (&connection, program, INSTALLED_NEW)).await?;
-        ui.progress("trying", &at.host);
-        run(&at.host, &connection, &[INSTALLED, "swap"]).await?;
+        let facts = at.daemon(session).await?.host().await?;
+        if facts.run_as.is_some() {
+            system::upgrade(ui, (&at.host, &connection), program).await?;
+        } else {
+            install(ui, &at.host, (&connection, program, INSTALLED_NEW)).await?;
+            ui.progress("trying", &at.host);
+            run(&at.host, &connection, &[INSTALLED, "swap"]).await?;
+        }
         at.check(ui, session).await
     }
 }
 
-/// Sends a program, or its like for the host's processor.
+/// Puts a program, or its like for the host's processor, into the home directory.
 async fn install(
     ui: &mut Ui,
     name: &str,
     (connection, own, to): (&Connection, &Path, &str),
 ) -> Result<(), CliError> {
+    run(name, connection, &["mkdir", "-p", DIRECTORIES[0]]).await?;
+    let whole = send(ui, name, (connection, own, to)).await?;
+    ui.stage("installed", &format!("{name}: ~/{to} ({})", size(whole)));
+    Ok(())
+}
+
+/// Sends a program, or its like for the host's processor; gives its size.
+async fn send(
+    ui: &mut Ui,
+    name: &str,
+    (connection, own, to): (&Connection, &Path, &str),
+) -> Result<u64, CliError> {
     let said = run(name, connection, &["uname", "-m"]).await?;
     let machine = String::from_utf8_lossy(&said).trim().to_owned();
     let program = program_for(name, own, &machine)?;
-    run(name, connection, &["mkdir", "-p", DIRECTORIES[0]]).await?;
     let whole = std::fs::metadata(&program).map_or(0, |found| found.len());
     let mut told = |sent: u64| {
         ui.progress(
@@ -297,8 +337,7 @@ async fn install(
     };
     let sent = connection.upload(&program, to, 0o755, &mut told).await;
     sent.map_err(|error| unreachable_host(name, &error))?;
-    ui.stage("installed", &format!("{name}: ~/{to} ({})", size(whole)));
-    Ok(())
+    Ok(whole)
 }
 
 /// The hosts that were added.
@@ -395,6 +434,8 @@ fn show(ui: &mut Ui, host: &str, facts: &HostFacts) -> Result<(), CliError> {
             ),
             Err(why) => format!("no Docker: {why}"),
         };
+        let run_as = facts.run_as.as_ref();
+        let run_as = run_as.map_or_else(String::new, |user| format!("\n  federates are: {user}"));
         format!(
             "{host}: {} as {}, ictusd {}\n  {} with {} processors ({}), Linux {}, {} free\n  {docker}\n{}\n  starts at boot: {}",
             facts.hostname,
@@ -405,7 +446,7 @@ fn show(ui: &mut Ui, host: &str, facts: &HostFacts) -> Result<(), CliError> {
             ranges(&facts.gives.cpus),
             facts.kernel,
             size(facts.disk_free),
-            given(&facts.gives),
+            given(&facts.gives) + &run_as,
             yes(facts.starts_at_boot),
         )
     })
@@ -419,6 +460,7 @@ fn given(gives: &Gives) -> String {
     };
     let priority = |highest: &u8| format!("up to priority {highest}");
     let others = match gives.uid {
+        0 if gives.refuses_root => "yes, but not as root".to_owned(),
         0 => "yes, it is root".to_owned(),
         uid => format!("in containers only: its daemon runs as user {uid}"),
     };

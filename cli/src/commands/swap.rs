@@ -1,6 +1,7 @@
 //! `ictusd swap`: what `ictus host upgrade` has the installed program do on its host. It outlives the connection, tries the
 //! program beside it, and takes its own place back when that one does not come up.
 
+use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
 use std::process::Stdio;
 use std::time::Duration;
@@ -63,6 +64,7 @@ async fn take_over(paths: &Paths, program: &Path) -> Result<(), Broken> {
     let log = std::fs::OpenOptions::new()
         .append(true)
         .create(true)
+        .mode(0o600)
         .open(paths.daemon_log());
     let log = log.map_err(|error| Broken(error.to_string()))?;
     let mut command = tokio::process::Command::new(program);

@@ -9,6 +9,7 @@ use std::time::Duration;
 use ictus_deploy::placement::SshClient;
 use ictus_deploy::ssh::{Connection, Method, Options, SshError, Target};
 use ictusd::client::{Client, Dial, Dialled, Duplex};
+use ictusd::installation::PROGRAM;
 use tokio::io::AsyncReadExt;
 
 use super::INSTALLED;
@@ -24,6 +25,8 @@ const BANNER_BYTES_MAX: usize = 64 << 10;
 struct Host {
     name: String,
     connection: Connection,
+    /// Its ictusd: whoever logs in may have one of its own, which comes before the host's.
+    program: &'static str,
 }
 
 impl fmt::Debug for Host {
@@ -58,15 +61,21 @@ pub(super) async fn connect(
 ) -> Result<Client, CliError> {
     let opened = Connection::open(&target(at)?, &options(client, identity)).await;
     let connection = opened.map_err(|error| unreachable_host(name, &error))?;
-    let dial = Host {
+    let mut dial = Host {
         name: name.to_owned(),
         connection,
+        program: INSTALLED,
     };
     // Whether anybody answers is known before anything is asked of it.
-    drop(dial.greeted().await.map_err(|error| {
+    let mut greeted = dial.greeted().await.map(drop);
+    if greeted.is_err() && !dial.has(INSTALLED).await && dial.has(PROGRAM).await {
+        dial.program = PROGRAM;
+        greeted = dial.greeted().await.map(drop);
+    }
+    greeted.map_err(|error| {
         let message = format!("host `{name}`: {error}");
         CliError::new(Kind::Unreachable, message)
-    })?);
+    })?;
     Ok(Client::over(Arc::new(dial)))
 }
 
@@ -82,9 +91,15 @@ pub(crate) fn unreachable_host(name: &str, error: &SshError) -> CliError {
 }
 
 impl Host {
+    /// Whether a file is there.
+    async fn has(&self, path: &str) -> bool {
+        let looked = self.connection.run(&["test", "-e", path], &[]).await;
+        looked.is_ok_and(|output| output.code == 0)
+    }
+
     /// A channel on which the daemon answers next.
     async fn greeted(&self) -> io::Result<Box<dyn Duplex>> {
-        let channel = self.connection.exec(&[INSTALLED, "dial-stdio"]).await;
+        let channel = self.connection.exec(&[self.program, "dial-stdio"]).await;
         let mut channel = channel.map_err(io::Error::other)?;
         let greeting = async {
             let (mut line, mut read) = (Vec::new(), 0);

@@ -178,6 +178,10 @@ pub struct HostFacts {
     pub docker: Result<DockerFacts, String>,
     /// Whether systemd starts the daemon again after a reboot.
     pub starts_at_boot: bool,
+    /// Who federates are that the manifest gives no user, where the daemon is the whole host's; absent: one user's daemon,
+    /// and the same user.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub run_as: Option<String>,
 }
 
 /// A Docker engine.

@@ -42,6 +42,7 @@ pub(crate) fn of_this_host(paths: &Paths, user: &str) -> Gives {
             user,
         ),
         secrets: Place::find(paths).map(|place| place.path().to_path_buf()),
+        refuses_root: paths.shared().is_some_and(|shared| !shared.allow_root),
     }
 }
 

@@ -21,6 +21,7 @@ use super::launch::Run;
 use crate::agent::{MemberId, RTI};
 use crate::docker::{Binding, Container, ContainerSpec, Engine, EngineError, label};
 use crate::files;
+use crate::host::unnamed;
 use crate::identity::ProcessIdentity;
 use crate::secrets;
 use crate::store::{Record, Supervised};
@@ -142,6 +143,12 @@ impl Contained {
         if let Some(papers) = run.papers(member_name) {
             files.extend(Papers::FILES.map(|file| papers.join(file)));
         }
+        let mut needs = federate
+            .map(|federate| federate.needs.clone())
+            .unwrap_or_default();
+        // By number: the image need not know who that is.
+        let unnamed = || unnamed(run.paths).map(|account| account.numbers());
+        needs.user = needs.user.or_else(unnamed);
         Some(Self {
             name,
             labels: labels
@@ -149,9 +156,7 @@ impl Contained {
                 .into(),
             instance: supervised.instance.clone(),
             source,
-            needs: federate
-                .map(|federate| federate.needs.clone())
-                .unwrap_or_default(),
+            needs,
             secrets: federate
                 .filter(|federate| !federate.needs.secrets.is_empty())
                 .and_then(|federate| {

@@ -8,9 +8,9 @@ use ictus_deploy::placement::Security;
 use ictus_deploy::{Engine, FederateKind, FederateRun, rti};
 
 use crate::agent::{MemberId, RTI};
-use crate::api::StartRequest;
 use crate::api::part::Part;
-use crate::host::account;
+use crate::api::{ApiError, StartRequest};
+use crate::host::{account, unnamed};
 use crate::paths::Paths;
 use crate::secrets;
 use crate::store::{Directory, Record, Supervised};
@@ -34,11 +34,14 @@ pub(crate) struct Run<'a> {
 }
 
 /// What a member's supervisor is to run.
+///
+/// # Errors
+/// When the user that the manifest gives a federate is not there any more.
 pub(crate) fn spec(
     run: &Run<'_>,
     (member, rti_port): (MemberId, Option<u16>),
     supervised: &Supervised,
-) -> Spec {
+) -> Result<Spec, ApiError> {
     let (directory, request) = (run.directory, run.request);
     let federate = match member {
         MemberId::Rti => None,
@@ -66,13 +69,20 @@ pub(crate) fn spec(
     } else {
         request.cwd.clone()
     };
-    Spec {
+    let limits = match federate {
+        Some(federate) => run.limits(federate)?,
+        None => Limits {
+            account: unnamed(run.paths).filter(|_| supervised.container.is_none()),
+            ..Limits::default()
+        },
+    };
+    Ok(Spec {
         protocol: PROTOCOL,
         program,
         args,
         env,
         cwd,
-        limits: federate.map(|it| run.limits(it)).unwrap_or_default(),
+        limits,
         status: federate.is_none_or(|run| run.kind == FederateKind::Ours),
         log: log_path(&directory.logs(), &name),
         log_size_max: request.settings.log_max_size,
@@ -82,7 +92,7 @@ pub(crate) fn spec(
         linger_ms: LINGER_MS,
         instance: supervised.instance.clone(),
         name,
-    }
+    })
 }
 
 /// This executable: the multi-call binary, which has the RTI and the supervisor.
@@ -128,12 +138,13 @@ impl Run<'_> {
     }
 
     /// What a federate is bound to before its program is executed; the rest is its container's.
-    fn limits(&self, federate: &FederateRun) -> Limits {
+    fn limits(&self, federate: &FederateRun) -> Result<Limits, ApiError> {
         let needs = &federate.needs;
         let part = self.request.part.as_ref();
         let contained = part.is_some_and(|part| part.engine == Engine::Docker);
-        let account = account(self.request, federate).ok().flatten();
-        Limits {
+        // Whoever is not there any more is not root instead.
+        let account = account(self.paths, self.request, federate)?;
+        Ok(Limits {
             cpus: match contained {
                 true => Vec::new(),
                 false => needs.cpus.clone(),
@@ -141,7 +152,7 @@ impl Run<'_> {
             realtime: needs.realtime,
             account: account.filter(|_| !contained),
             no_core: !needs.secrets.is_empty(),
-        }
+        })
     }
 
     fn rti_args(&self) -> Vec<String> {

@@ -55,6 +55,8 @@ pub(crate) struct Link {
 pub(crate) enum Origin {
     /// It is to be started.
     Launch(Box<Spec>),
+    /// It cannot be started, for this reason.
+    Refused(String),
     /// It was started by another daemon.
     Adopt(Option<ProcessIdentity>),
 }
@@ -98,6 +100,7 @@ impl Link {
     pub(crate) async fn run(mut self, origin: Origin) {
         let connected = match origin {
             Origin::Launch(spec) => self.launch(&spec).await,
+            Origin::Refused(why) => Err(Failed::NotSupervised(why)),
             Origin::Adopt(recorded) => self.adopt(recorded).await,
         };
         match connected {

@@ -9,9 +9,11 @@ use ictus_stream::Papers;
 
 use super::{Host, error, error_of, recorded, store_error, with_sources};
 use crate::accounts::{self, Account};
+use crate::agent::RTI;
 use crate::api::secret::{SecretValues, SecretsChanged};
 use crate::api::{ApiError, ErrorCode, StartRequest};
 use crate::facts;
+use crate::paths::Paths;
 use crate::secrets::{self, KeptSecrets, SecretsError};
 use crate::store::Directory;
 
@@ -34,12 +36,19 @@ impl Host {
             if let Some(lack) = gives.lacks(engine(request), &run.needs).first() {
                 return Err(refused(&lack.what, &lack.fix));
             }
-            let Some(account) = account(request, run)?.filter(|_| !contained(request)) else {
+            let Some(user) = run.needs.user.as_deref().filter(|_| !contained(request)) else {
+                continue;
+            };
+            let Some(account) = account(self.paths(), request, run)? else {
+                // Root may have other names.
+                if gives.refuses_root {
+                    let lack = gives.no_root(user);
+                    return Err(refused(&lack.what, &lack.fix));
+                }
                 continue;
             };
             let parent = self.paths().state.parent();
             if let Some(closed) = parent.and_then(|path| accounts::closed_to(path, &account)) {
-                let user = run.needs.user.as_deref().unwrap_or_default();
                 let what = format!("user `{user}`, who may not enter {}", closed.display());
                 let fix = "set ICTUS_STATE_DIR of its daemon to a directory that everybody may enter, as /var/lib/ictus";
                 return Err(refused(&what, fix));
@@ -55,7 +64,7 @@ impl Host {
         request: &StartRequest,
         values: &SecretValues,
     ) -> Result<Option<KeptSecrets>, ApiError> {
-        let federates = here(request).map(|run| Ok((run, account(request, run)?)));
+        let federates = here(request).map(|run| Ok((run, account(self.paths(), request, run)?)));
         let federates: Vec<_> = federates.collect::<Result<_, ApiError>>()?;
         let kept = secrets::hand_over(self.paths(), name, &federates, values);
         kept.map_err(|error| secrets_error(&error))
@@ -86,7 +95,8 @@ impl Host {
         directory: &Directory,
         request: &StartRequest,
     ) -> Result<(), ApiError> {
-        let others = here(request).any(|run| run.needs.user.is_some());
+        let shared = self.paths().shared();
+        let others = shared.is_some() || here(request).any(|run| run.needs.user.is_some());
         if !others || contained(request) || !rustix::process::geteuid().is_root() {
             return Ok(());
         }
@@ -104,12 +114,16 @@ impl Host {
         for program in programs {
             set_mode(&paths.blobs().join(program), 0o755)?;
         }
-        for run in here(request).filter(|run| directory.papers(&run.name).exists()) {
-            let Some(account) = account(request, run)? else {
+        let mut members = vec![(RTI, unnamed(paths))];
+        for run in here(request) {
+            members.push((&run.name, account(paths, request, run)?));
+        }
+        for (member, account) in members {
+            let papers = directory.papers(member);
+            let Some(account) = account.filter(|_| papers.exists()) else {
                 continue;
             };
             enter(&directory.all_papers())?;
-            let papers = directory.papers(&run.name);
             let files = Papers::FILES.map(|file| papers.join(file));
             for path in files.iter().chain([&papers]) {
                 chown(path, Some(account.uid), Some(account.gid)).map_err(|error| {
@@ -140,13 +154,21 @@ fn contained(request: &StartRequest) -> bool {
     engine(request) == Engine::Docker
 }
 
+/// Who the RTI is, and every federate that the manifest gives no user, when that is not who the daemon is.
+pub(crate) fn unnamed(paths: &Paths) -> Option<Account> {
+    let own = rustix::process::geteuid().as_raw();
+    let run_as = paths.shared().map(|shared| shared.run_as.clone());
+    run_as.filter(|account| account.uid != own)
+}
+
 /// Who a federate is, when it is not who the daemon is.
 pub(crate) fn account(
+    paths: &Paths,
     request: &StartRequest,
     run: &FederateRun,
 ) -> Result<Option<Account>, ApiError> {
     let Some(user) = run.needs.user.as_deref() else {
-        return Ok(None);
+        return Ok(unnamed(paths));
     };
     let own = rustix::process::geteuid().as_raw();
     if contained(request) {

@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use axum::Router;
 use axum::body::{Body, Bytes};
-use axum::extract::{DefaultBodyLimit, Path, Query, State};
+use axum::extract::{ConnectInfo, DefaultBodyLimit, Path, Query, State};
 use axum::response::{Json, Response};
 use axum::routing::{get, post, put};
 use futures_util::StreamExt;
@@ -26,7 +26,7 @@ use crate::facts;
 use crate::federation::container::Images;
 use crate::host::Host;
 
-use super::{JsonLines, StarterGuard, bad_request, pass_until_end, stream};
+use super::{Caller, JsonLines, StarterGuard, bad_request, pass_until_end, stream};
 
 /// How long the engine may take to say what it is, before a host is told without it.
 const ENGINE_MAX: Duration = Duration::from_secs(4);
@@ -112,9 +112,11 @@ async fn leases(State(host): State<Host>) -> Json<Vec<LeaseView>> {
 async fn take(
     State(host): State<Host>,
     Path(name): Path<String>,
+    ConnectInfo(caller): ConnectInfo<Caller>,
     body: Bytes,
 ) -> Result<Json<Lease>, ApiError> {
-    let request: LeaseRequest = parse(&body)?;
+    let mut request: LeaseRequest = parse(&body)?;
+    request.who = caller.named(request.who);
     host.take_lease(&name, &request).map(Json)
 }
 
@@ -130,6 +132,7 @@ async fn release(
     State(host): State<Host>,
     Path(name): Path<String>,
     Query(query): Query<ReleaseQuery>,
+    ConnectInfo(caller): ConnectInfo<Caller>,
 ) -> Result<Json<Option<LeaseView>>, ApiError> {
     match (query.fence, query.r#break) {
         (Some(fence), None) => {
@@ -139,7 +142,10 @@ async fn release(
             timeout(COLLECTING_MAX, host.collect_images()).await.ok();
             Ok(Json(None))
         }
-        (None, Some(by)) => host.break_lease(&name, &by).map(Json),
+        (None, Some(by)) => {
+            let by = caller.named(by);
+            host.break_lease(&name, &by).map(Json)
+        }
         (Some(_), Some(_)) | (None, None) => Err(bad_request("either `fence` or `break`")),
     }
 }

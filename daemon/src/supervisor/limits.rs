@@ -4,6 +4,7 @@ use std::io;
 
 use ictus_deploy::placement::{Realtime, RealtimePolicy};
 use nix::libc;
+use rustix::fs::Mode;
 use rustix::process::{Gid, Resource, Rlimit, Uid};
 use rustix::thread::CpuSet;
 use serde::{Deserialize, Serialize};
@@ -108,5 +109,7 @@ fn become_user(account: &Account) -> io::Result<()> {
     rustix::thread::set_thread_groups(&groups)?;
     rustix::thread::set_thread_res_gid(gid, gid, gid)?;
     rustix::thread::set_thread_res_uid(uid, uid, uid)?;
+    // What a daemon of root's hides from others is not what this one does.
+    rustix::process::umask(Mode::from_raw_mode(0o022));
     Ok(())
 }

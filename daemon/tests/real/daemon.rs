@@ -5,6 +5,7 @@ use std::time::Duration;
 
 use ictusd::api::{ErrorCode, Event, FailureKind, Outcome, State};
 use ictusd::client::{Client, is_already_running};
+use ictusd::paths::Owner;
 
 use crate::world::{BOUND, Process, World, fakes, federation, next, outcome, spawn_daemon};
 
@@ -514,6 +515,7 @@ async fn a_stale_socket_is_replaced_and_two_daemons_never_serve() {
     let paths = ictusd::paths::Paths {
         run: state.join("run"),
         state,
+        owner: Owner::User,
     };
     paths.create().unwrap();
     // Dropped without removing the file: what a killed daemon leaves.
@@ -594,6 +596,7 @@ async fn a_daemon_that_owns_nothing_ends_and_leaves_nothing() {
     let paths = ictusd::paths::Paths {
         run: state.join("run"),
         state,
+        owner: Owner::User,
     };
     let mut daemon = spawn_daemon(&paths, "100");
     Process::of(daemon.id()).assert_ends();

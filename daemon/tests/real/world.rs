@@ -11,7 +11,7 @@ use ictus_coord::plan::{FederatePlan, Plan};
 use ictus_deploy::{FederateKind, FederateRun, Settings, TimingSpec};
 use ictusd::api::{Event, Happening, Outcome, StartRequest};
 use ictusd::client::{Client, Stream};
-use ictusd::paths::Paths;
+use ictusd::paths::{Owner, Paths};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::process::{Pid, PidfdFlags, Signal, pidfd_open, pidfd_send_signal};
 use tempfile::TempDir;
@@ -111,6 +111,7 @@ impl World {
         let paths = Paths {
             run: state.join("run"),
             state,
+            owner: Owner::User,
         };
         let daemon = spawn(&program, &paths, "60000");
         let client = Client::find(&paths).await.unwrap();

@@ -60,7 +60,7 @@ pub(super) async fn remove(host: &str, connection: &Connection) -> Result<(), Cl
 }
 
 /// Whether systemd is what runs there, and not only installed.
-async fn has_systemd(host: &str, connection: &Connection) -> Result<bool, CliError> {
+pub(super) async fn has_systemd(host: &str, connection: &Connection) -> Result<bool, CliError> {
     let there = connection
         .run(&["test", "-d", "/run/systemd/system"], &[])
         .await;
