@@ -143,8 +143,13 @@ impl From<ClientError> for CliError {
         } else {
             None
         };
+        let far = matches!(error, ClientError::Far(_));
         let held = error.refusal().is_some_and(|it| it.code == ErrorCode::Held);
-        let kind = if held { Kind::Held } else { Kind::Failed };
+        let kind = match (held, far) {
+            (true, _) => Kind::Held,
+            (_, true) => Kind::Unreachable,
+            _ => Kind::Failed,
+        };
         let mut failed = Self::new(kind, error);
         if !known.is_empty() {
             failed = failed.hint(format!("known: {known}"));
@@ -153,5 +158,21 @@ impl From<ClientError> for CliError {
             failed = failed.hint(format!("its log is {}", log.display()));
         }
         failed
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::io;
+
+    use super::*;
+
+    /// A host that is lost after it was reached is one that cannot be reached.
+    #[test]
+    fn a_host_that_is_lost_later_is_unreachable_too() {
+        let lost = io::Error::other("host `pi`: the connection is closed");
+        let error = CliError::from(ClientError::Far(lost));
+        assert_eq!(error.code(), 4);
+        assert_eq!(error.to_string(), "host `pi`: the connection is closed");
     }
 }

@@ -59,7 +59,7 @@ enum Way {
     Dial(Arc<dyn Dial>),
 }
 
-/// Makes connections to the daemon of another host.
+/// Makes connections to the daemon of another host; its errors name the host.
 pub trait Dial: fmt::Debug + Send + Sync {
     /// One connection, over which the daemon already answers.
     fn dial(&self) -> Dialled<'_>;
@@ -109,6 +109,9 @@ pub enum ClientError {
         /// Why.
         source: io::Error,
     },
+    /// The daemon of another host cannot be reached (any more).
+    #[error("{0}")]
+    Far(io::Error),
     /// The daemon does not answer; it may be stopped or overloaded.
     #[error("the daemon{} does not answer{}", named(*.pid), way_out(*.pid))]
     Silent {
@@ -143,6 +146,7 @@ impl ClientError {
             | Self::NotMember { .. }
             | Self::NotServing
             | Self::Unreachable { .. }
+            | Self::Far(_)
             | Self::Silent { .. }
             | Self::Broken(_)
             | Self::NotUnderstood(_)
@@ -510,11 +514,13 @@ impl Client {
     }
 
     fn unreachable(&self, source: io::Error) -> ClientError {
-        let socket = match &self.way {
-            Way::Socket(socket) => socket.clone(),
-            Way::Dial(_) => PathBuf::new(),
-        };
-        ClientError::Unreachable { socket, source }
+        match &self.way {
+            Way::Socket(socket) => ClientError::Unreachable {
+                socket: socket.clone(),
+                source,
+            },
+            Way::Dial(_) => ClientError::Far(source),
+        }
     }
 }
 

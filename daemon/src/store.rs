@@ -83,6 +83,15 @@ pub enum StoreError {
         /// Why.
         source: io::Error,
     },
+    /// Another user has written there, whose files this one cannot remove: a container with a `user` of its own.
+    #[error(
+        "cannot remove {path}: another user has written there, as federates with `user` may; `sudo rm -r {path}` on that host removes it",
+        path = path.display()
+    )]
+    Others {
+        /// The directory.
+        path: PathBuf,
+    },
     /// A file is not what it should be.
     #[error("{path} is damaged", path = path.display())]
     Damaged {
@@ -260,7 +269,7 @@ impl Directory {
         let entries = fs::read_dir(&self.0).into_iter().flatten().flatten();
         for path in entries.map(|entry| entry.path()) {
             if path != self.history() {
-                files::remove(&path).map_err(io_at(&path))?;
+                files::remove(&path).map_err(kept_at(&path))?;
             }
         }
         // Fails when something is in it.
@@ -359,7 +368,7 @@ impl Directory {
                 return Ok(kept(self.history()).into_iter().collect());
             }
             Leave::Nothing => {
-                files::remove(&self.0).map_err(io_at(&self.0))?;
+                files::remove(&self.0).map_err(kept_at(&self.0))?;
                 return Ok(Vec::new());
             }
         }
@@ -370,7 +379,7 @@ impl Directory {
             self.specs(),
             self.all_papers(),
         ] {
-            files::remove(&path).map_err(io_at(&path))?;
+            files::remove(&path).map_err(kept_at(&path))?;
         }
         let left = [
             self.logs(),
@@ -398,9 +407,20 @@ impl Directory {
             self.timing(),
             self.work(),
         ] {
-            files::remove(&path).map_err(io_at(&path))?;
+            files::remove(&path).map_err(kept_at(&path))?;
         }
         Ok(())
+    }
+}
+
+/// Why something stays that was to be removed.
+fn kept_at(path: &Path) -> impl FnOnce(io::Error) -> StoreError {
+    let path = path.to_path_buf();
+    move |source| {
+        if source.kind() == io::ErrorKind::PermissionDenied {
+            return StoreError::Others { path };
+        }
+        StoreError::Io { path, source }
     }
 }
 
@@ -450,7 +470,22 @@ fn io_at(path: &Path) -> impl Fn(io::Error) -> StoreError + use<> {
 
 #[cfg(test)]
 mod tests {
-    use super::is_name;
+    use std::io;
+    use std::path::Path;
+
+    use super::{is_name, kept_at};
+
+    #[test]
+    fn what_cannot_be_removed_is_told_with_the_way_out() {
+        let told = |kind: io::ErrorKind| kept_at(Path::new("/s/work"))(kind.into()).to_string();
+        assert!(
+            told(io::ErrorKind::PermissionDenied).contains("`sudo rm -r /s/work` on that host")
+        );
+        assert_eq!(
+            told(io::ErrorKind::ReadOnlyFilesystem),
+            "cannot use /s/work"
+        );
+    }
 
     #[test]
     fn names_cannot_leave_their_directory() {

@@ -8,7 +8,7 @@ use std::time::Duration;
 
 use ictus_deploy::placement::SshClient;
 use ictus_deploy::ssh::{Connection, Method, Options, SshError, Target};
-use ictusd::client::{Client, Dial, Dialled, Duplex};
+use ictusd::client::{Client, ClientError, Dial, Dialled, Duplex};
 use ictusd::installation::PROGRAM;
 use tokio::io::AsyncReadExt;
 
@@ -67,15 +67,12 @@ pub(super) async fn connect(
         program: INSTALLED,
     };
     // Whether anybody answers is known before anything is asked of it.
-    let mut greeted = dial.greeted().await.map(drop);
+    let mut greeted = dial.dial().await.map(drop);
     if greeted.is_err() && !dial.has(INSTALLED).await && dial.has(PROGRAM).await {
         dial.program = PROGRAM;
-        greeted = dial.greeted().await.map(drop);
+        greeted = dial.dial().await.map(drop);
     }
-    greeted.map_err(|error| {
-        let message = format!("host `{name}`: {error}");
-        CliError::new(Kind::Unreachable, message)
-    })?;
+    greeted.map_err(ClientError::Far)?;
     Ok(Client::over(Arc::new(dial)))
 }
 
@@ -148,6 +145,12 @@ impl Host {
 
 impl Dial for Host {
     fn dial(&self) -> Dialled<'_> {
-        Box::pin(self.greeted())
+        Box::pin(async {
+            let greeted = self.greeted().await;
+            greeted.map_err(|error| {
+                let message = format!("host `{}`: {error}", self.name);
+                io::Error::new(error.kind(), message)
+            })
+        })
     }
 }
