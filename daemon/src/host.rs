@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 use std::net::SocketAddr;
 use std::path::PathBuf;
+use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use tokio::sync::{broadcast, watch};
@@ -45,6 +46,8 @@ struct Inner {
     /// Where metrics are served over TCP.
     listeners: Mutex<Listeners>,
     leases: Mutex<Leases>,
+    /// How many prepared parts wait for their commit, or for being given up.
+    awaited: AtomicUsize,
     /// The origin of the leases' time.
     origin: Instant,
     told: broadcast::Sender<Happening>,
@@ -60,6 +63,7 @@ impl Host {
             living: Mutex::default(),
             listeners: Mutex::default(),
             leases: Mutex::default(),
+            awaited: AtomicUsize::new(0),
             origin: Instant::now(),
             told: broadcast::channel(EVENTS_MAX).0,
             active: watch::channel(Instant::now()).0,
@@ -80,6 +84,7 @@ impl Host {
             match recorded(&name, &directory) {
                 Ok(Some(record)) if record.view.state == State::Prepared => {
                     tracing::info!(%name, run = record.view.id, "prepared, and not committed");
+                    self.await_commit(&name, &record.view.id);
                 }
                 Ok(Some(record)) if record.view.state == State::WaitingForSecrets => {}
                 Ok(Some(record)) if lost_secrets(&record, &directory) => {
@@ -399,6 +404,7 @@ impl Host {
         let undriven = |name: &String| self.check_driven(name).is_err();
         !self.living().is_empty()
             || !self.lease_views().is_empty()
+            || self.0.awaited.load(Ordering::Relaxed) > 0
             || self.names().iter().any(undriven)
     }
 

@@ -167,6 +167,16 @@ impl Leases {
         }
     }
 
+    /// How long a lease still lasts, and for how long it was given; absent when nobody holds one.
+    pub(crate) fn left(&self, since: Duration, federation: &str) -> Option<(Duration, Duration)> {
+        let held = self.held.get(federation)?;
+        let left = held
+            .until
+            .checked_sub(since)
+            .filter(|left| !left.is_zero())?;
+        Some((left, Duration::from_millis(held.kept.ttl_ms)))
+    }
+
     /// Those that are held.
     pub(crate) fn views(&self, since: Duration) -> Vec<LeaseView> {
         let held = self.held.iter().filter(|(_, held)| since < held.until);

@@ -2,9 +2,12 @@
 
 use std::collections::BTreeSet;
 use std::io::Read;
+use std::sync::atomic::Ordering;
+use std::time::Duration;
 
 use ictus_deploy::Engine;
 use ictus_deploy::placement::Security;
+use tokio::time::sleep;
 
 use crate::agent::{MemberId, RTI};
 use crate::api::part::{
@@ -20,9 +23,13 @@ use crate::leases::{LeaseError, Leases};
 use crate::ports::{self, Assigned};
 use crate::secrets;
 use crate::stamp;
-use crate::store::{self, StoreError};
+use crate::store::{self, Leave, StoreError};
 
 use super::{Host, error, error_of, recorded, store_error, validate, with_sources};
+
+/// How long a prepared part waits for somebody to take its lease when an earlier daemon did not keep for how long it was
+/// given.
+const ABANDONED_AFTER: Duration = Duration::from_secs(30);
 
 impl Host {
     /// Takes over what an earlier daemon kept of leases.
@@ -157,10 +164,55 @@ impl Host {
         record.view.generation = prepare.generation;
         let written = directory.write_record(&record);
         written.map_err(|error| store_error(&error))?;
+        self.await_commit(name, &record.view.id);
         Ok(Prepared {
             id: record.view.id,
             rti_port: record.view.rti_port,
         })
+    }
+
+    /// Removes a prepared part that nobody can commit any more: whoever held its lease is gone, and nobody has taken it for
+    /// as long again. Until then whoever comes next finds what was planned on.
+    pub(crate) fn await_commit(&self, name: &str, id: &str) {
+        let (host, name, id) = (self.clone(), name.to_owned(), id.to_owned());
+        self.0.awaited.fetch_add(1, Ordering::Relaxed);
+        tokio::spawn(async move {
+            host.abandon(&name, &id).await;
+            host.0.awaited.fetch_sub(1, Ordering::Relaxed);
+        });
+    }
+
+    async fn abandon(&self, name: &str, id: &str) {
+        let (mut patience, mut alone) = (ABANDONED_AFTER, false);
+        while self.is_prepared(name, id) {
+            let left = self.leases().left(self.since(), name);
+            match left {
+                Some((left, whole)) => {
+                    (patience, alone) = (whole, false);
+                    sleep(left).await;
+                }
+                None if !alone => {
+                    alone = true;
+                    sleep(patience).await;
+                }
+                None => {
+                    tracing::warn!(name, run = id, "nobody has committed it; it is removed");
+                    let Err(error) = self.remove(name, (Leave::Logs, None)).await else {
+                        return;
+                    };
+                    if error.code != ErrorCode::Held {
+                        tracing::error!(name, error = error.message, "not removed");
+                        return;
+                    }
+                    alone = false;
+                }
+            }
+        }
+    }
+
+    fn is_prepared(&self, name: &str, id: &str) -> bool {
+        let record = recorded(name, &self.directory(name)).ok().flatten();
+        record.is_some_and(|it| it.view.state == State::Prepared && it.view.id == id)
     }
 
     /// Ports that other federations of this host have, or will have when they are committed.

@@ -5,6 +5,7 @@ use std::net::{Ipv4Addr, SocketAddrV4, TcpListener};
 use std::os::unix::fs::PermissionsExt as _;
 use std::sync::Arc;
 use std::sync::atomic::AtomicU64;
+use std::time::Duration;
 
 use ictus_deploy::Engine;
 use ictus_deploy::placement::{PortRange, Security, Way};
@@ -15,7 +16,7 @@ use ictusd::api::secret::SecretValues;
 use ictusd::api::{ErrorCode, Event, ExitReason, Outcome, StartRequest, State};
 use ictusd::client::ClientError;
 
-use crate::world::{Process, World, fakes, federation, next, outcome};
+use crate::world::{BOUND, Process, World, fakes, federation, next, outcome};
 
 const HOME: Ipv4Addr = Ipv4Addr::LOCALHOST;
 const NAME: &str = "fake";
@@ -301,6 +302,47 @@ async fn only_the_holder_of_the_lease_changes_a_part() {
     let late = world.client.remove_part((NAME, fence), true).await;
     assert_eq!(refusal(late.unwrap_err()).0, ErrorCode::Held);
     world.client.remove_part((NAME, newer), true).await.unwrap();
+}
+
+#[tokio::test]
+async fn what_nobody_commits_is_removed_when_its_lease_has_ended() {
+    let world = World::new().await;
+    let mut request = part(&federation(&[("a", ""), ("b", "")]), "one", "");
+    request.part.as_mut().unwrap().programs.clear();
+    let prepare = prepare(request, None);
+    let short = LeaseRequest {
+        who: "a test".to_owned(),
+        ttl_ms: 300,
+    };
+    let fence = world.client.lease(NAME, &short).await.unwrap().fence;
+    world.client.prepare((NAME, fence), &prepare).await.unwrap();
+    // Who takes the lease in time finds it, and keeps it for as long as that one lasts.
+    let fence = until(async || world.client.lease(NAME, &short).await.ok())
+        .await
+        .fence;
+    let there = world.client.federation(NAME).await.unwrap();
+    assert_eq!(there.state, State::Prepared);
+    until(async || {
+        let left = world.client.federations().await.unwrap();
+        left.is_empty().then_some(())
+    })
+    .await;
+    let late = world.client.commit(NAME, &commit(fence, None)).await;
+    refusal(late.unwrap_err());
+    world.client.remove(NAME, true).await.ok();
+}
+
+/// Asks again until there is an answer.
+async fn until<T>(ask: impl AsyncFn() -> Option<T>) -> T {
+    let asked = async {
+        loop {
+            if let Some(answer) = ask().await {
+                return answer;
+            }
+            tokio::time::sleep(Duration::from_millis(10)).await;
+        }
+    };
+    tokio::time::timeout(BOUND, asked).await.unwrap()
 }
 
 #[tokio::test]
