@@ -3,7 +3,6 @@
 use std::collections::BTreeMap;
 use std::net::SocketAddr;
 use std::path::PathBuf;
-use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use tokio::sync::{broadcast, watch};
@@ -46,8 +45,6 @@ struct Inner {
     /// Where metrics are served over TCP.
     listeners: Mutex<Listeners>,
     leases: Mutex<Leases>,
-    /// How many prepared parts wait for their commit, or for being given up.
-    awaited: AtomicUsize,
     /// The origin of the leases' time.
     origin: Instant,
     told: broadcast::Sender<Happening>,
@@ -63,7 +60,6 @@ impl Host {
             living: Mutex::default(),
             listeners: Mutex::default(),
             leases: Mutex::default(),
-            awaited: AtomicUsize::new(0),
             origin: Instant::now(),
             told: broadcast::channel(EVENTS_MAX).0,
             active: watch::channel(Instant::now()).0,
@@ -399,12 +395,20 @@ impl Host {
         names
     }
 
+    /// The run that is prepared, and not committed.
+    fn prepared(&self, name: &str) -> Option<String> {
+        let record = recorded(name, &self.directory(name)).ok().flatten();
+        let prepared = record.filter(|record| record.view.state == State::Prepared);
+        prepared.map(|record| record.view.id)
+    }
+
     /// Whether anything runs that would have nobody to stop it without a daemon.
     fn owns_something(&self) -> bool {
-        let undriven = |name: &String| self.check_driven(name).is_err();
+        // A prepared part is given up by a daemon that is there.
+        let undriven =
+            |name: &String| self.prepared(name).is_some() || self.check_driven(name).is_err();
         !self.living().is_empty()
             || !self.lease_views().is_empty()
-            || self.0.awaited.load(Ordering::Relaxed) > 0
             || self.names().iter().any(undriven)
     }
 

@@ -9,7 +9,7 @@
 use std::fs;
 
 use ictus_tests::rig::{Host, Rig};
-use ictus_tests::said;
+use ictus_tests::{ictus, said};
 use serde_json::Value;
 
 use super::Scenario;
@@ -26,6 +26,10 @@ pub(crate) const SCENARIOS: &[Scenario] = &[
     (
         "no_federate_is_root_unless_the_host_allows_it",
         no_federate_is_root_unless_the_host_allows_it,
+    ),
+    (
+        "where_there_is_systemd_it_starts_ictusd",
+        where_there_is_systemd_it_starts_ictusd,
     ),
 ];
 
@@ -185,4 +189,81 @@ fn no_federate_is_root_unless_the_host_allows_it(rig: &Rig) {
     operator.ok(&["down", &as_root, "--purge"]);
     operator.leave();
     leave(second);
+}
+
+/// A stand-in for systemd, which test hosts have not: it knows one unit a manager, and writes down what it is asked.
+const SYSTEMCTL: &str = r#"mkdir -p /run/systemd/system
+touch /small/asked && chmod 666 /small/asked
+cat > /usr/local/bin/systemctl <<'END'
+#!/bin/sh
+echo "$*" >> /small/asked
+unit=/etc/systemd/system/ictusd.service
+wants=/etc/systemd/system/multi-user.target.wants
+if [ "$1" = --user ]; then
+    shift
+    unit=$HOME/.config/systemd/user/ictusd.service
+    wants=$HOME/.config/systemd/user/default.target.wants
+fi
+serve() {
+    pkill -u "$(id -u)" -f '[i]ctusd daemon'
+    setsid $(sed -n "s,%h,$HOME,; s/^ExecStart=//p" "$unit") < /dev/null > /dev/null 2>&1 &
+}
+case "$1" in
+daemon-reload | reset-failed) ;;
+is-enabled) [ -e "$wants/ictusd.service" ] ;;
+enable)
+    mkdir -p "$wants" && ln -sf "$unit" "$wants/ictusd.service"
+    if [ "$2" = --now ]; then serve; fi
+    ;;
+restart) serve ;;
+is-failed) ! pgrep -u "$(id -u)" -f '[i]ctusd daemon' > /dev/null ;;
+disable) rm -r "$wants" ;;
+*) exit 1 ;;
+esac
+END
+mkdir -p -m 777 /var/lib/systemd/linger
+printf '#!/bin/sh\ntouch /var/lib/systemd/linger/robot\n' > /usr/local/bin/loginctl
+chmod 755 /usr/local/bin/systemctl /usr/local/bin/loginctl
+"#;
+
+fn where_there_is_systemd_it_starts_ictusd(rig: &Rig) {
+    let operator = Operator::new(rig);
+    let host = &rig.hosts()[0];
+    let at = target(host);
+    let_in(host);
+    host.script(
+        "mkdir -p /var/cache/before && cp -a /etc/systemd /var/cache/before/",
+        &[],
+    );
+    host.script(SYSTEMCTL, &[]);
+    for (kind, whose) in [("--system", ""), ("--at-boot", "--user ")] {
+        let told = operator.ok(&["host", "add", &at, kind, "--accept-new"]);
+        assert!(told.contains("starts at boot: yes"), "{told}");
+        operator.ok(&["host", "upgrade", &at]);
+        let asked = host.script("cat /small/asked; : > /small/asked", &[]);
+        let restarted = format!("{whose}restart ictusd.service\n");
+        assert!(asked.contains(&restarted), "{asked}");
+        let broken = ictus().with_file_name("diamond");
+        let broken = [
+            "host",
+            "upgrade",
+            &at,
+            "--program",
+            broken.to_str().unwrap(),
+        ];
+        let told = operator.fails(&broken, 1);
+        assert!(told.contains("the one before serves again"), "{told}");
+        operator.ok(&["host", "rm", &at]);
+        let asked = host.script("cat /small/asked; : > /small/asked", &[]);
+        assert!(
+            asked.contains(&format!("{whose}disable --now ictusd.service")),
+            "{asked}"
+        );
+    }
+    host.script(
+        "rm -r /run/systemd /var/lib/systemd /usr/local/bin/systemctl /usr/local/bin/loginctl /small/asked /home/robot/.config\n\
+         rm -rf /etc/systemd && mv /var/cache/before/systemd /etc/ && rm -r /var/cache/before\n",
+        &[],
+    );
+    leave(host);
 }

@@ -1,6 +1,8 @@
 //! Runs a plan: the RTI and one process a federate, or one process for all.
 
+use ictus_stream::{Authority, Member};
 use serde_json::{Value, json};
+use std::ffi::OsStr;
 use std::fs;
 use std::io::{self, BufRead, BufReader, Read};
 use std::path::{Path, PathBuf};
@@ -34,6 +36,8 @@ pub(crate) struct Case {
     pub(crate) fast: bool,
     /// Decentralized coordination, and every federate's STP offset.
     pub(crate) stp_offset: Option<Duration>,
+    /// Under mutual TLS, as between hosts.
+    pub(crate) tls: bool,
 }
 
 type Port = (u16, &'static str, u32);
@@ -138,7 +142,16 @@ impl Bench {
     /// When a process cannot be started or fails.
     pub(crate) fn federated(&self, case: &Case) -> io::Result<Results> {
         let plan = self.write_plan(case)?;
-        let rti = Rti::start(&self.ictus, case.federates.len())?;
+        let tls = if case.tls {
+            Some(self.certify(case)?)
+        } else {
+            None
+        };
+        let papers = |member: &str| {
+            let directory = tls.as_ref().map(|tls| tls.join(member));
+            directory.map_or_else(Vec::new, |it| vec!["--tls".into(), it.into_os_string()])
+        };
+        let rti = Rti::start_with(&self.ictus, case.federates.len(), &papers("rti"))?;
         let memory = rti.watch_memory();
         let children: io::Result<Vec<Child>> = case
             .federates
@@ -148,6 +161,7 @@ impl Bench {
                 let mut command = self.federate(&plan);
                 command
                     .args(["--federate", name, "--rti", &address, "-i", FEDERATION])
+                    .args(papers(name))
                     .spawn()
             })
             .collect();
@@ -161,6 +175,19 @@ impl Bench {
             lines,
             rti_peak_kib,
         })
+    }
+
+    /// Gives every member a certificate of this run, in a directory of its name.
+    fn certify(&self, case: &Case) -> io::Result<PathBuf> {
+        let directory = self.directory.join("tls");
+        let authority = Authority::new(FEDERATION).map_err(io::Error::other)?;
+        let names = case.federates.iter().map(|(name, _, _)| *name);
+        let federates = names.zip((0..).map(Member::Federate));
+        for (name, member) in federates.chain([("rti", Member::Rti)]) {
+            let papers = authority.certify(member).map_err(io::Error::other)?;
+            papers.write(&directory.join(name))?;
+        }
+        Ok(directory)
     }
 
     /// A program of a plan, to be told which federate it is.
@@ -210,7 +237,7 @@ impl Rti {
     ///
     /// When it cannot be started or does not listen.
     pub(crate) fn start(ictus: &Path, federates: usize) -> io::Result<Self> {
-        Self::start_with(ictus, federates, &[])
+        Self::start_with::<&str>(ictus, federates, &[])
     }
 
     /// As [`Rti::start`], with more arguments.
@@ -218,10 +245,10 @@ impl Rti {
     /// # Errors
     ///
     /// As [`Rti::start`].
-    pub(crate) fn start_with(
+    pub(crate) fn start_with<A: AsRef<OsStr>>(
         ictus: &Path,
         federates: usize,
-        arguments: &[&str],
+        arguments: &[A],
     ) -> io::Result<Self> {
         let mut child = Command::new(ictus)
             .args([

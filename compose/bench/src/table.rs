@@ -91,7 +91,13 @@ impl Settings {
             "{:<26} {:>12} {:>26} {:>14}",
             "", "ictus", "floor", "peak MiB"
         )?;
-        for case in [source_sink, decentralized, pipeline, two_sources] {
+        for case in [
+            source_sink,
+            source_sink_under_tls,
+            decentralized,
+            pipeline,
+            two_sources,
+        ] {
             self.throughput(bench, &mut out, case)?;
         }
         if self.wants("rti") {
@@ -116,8 +122,9 @@ impl Settings {
             )?;
         }
         if self.wants("latency") {
-            self.latency(bench, &mut out, None)?;
-            self.latency(bench, &mut out, Some(Duration::ZERO))?;
+            self.latency(bench, &mut out, (None, false))?;
+            self.latency(bench, &mut out, (None, true))?;
+            self.latency(bench, &mut out, (Some(Duration::ZERO), false))?;
         }
         self.in_process(bench, &mut out)
     }
@@ -161,7 +168,7 @@ impl Settings {
         &self,
         bench: &Bench,
         out: &mut impl Write,
-        stp_offset: Option<Duration>,
+        (stp_offset, tls): (Option<Duration>, bool),
     ) -> io::Result<()> {
         let count = self.count(2000);
         let case = Case {
@@ -173,6 +180,7 @@ impl Settings {
             connections: vec![((0, "out", 0), (1, "input", 0), None)],
             fast: false,
             stp_offset,
+            tls,
         };
         let results = bench.federated(&case)?;
         let micros = |key| results.number(key).unwrap_or(f64::NAN) / 1000.0;
@@ -183,9 +191,10 @@ impl Settings {
         )?;
         row(
             out,
-            match stp_offset {
-                Some(_) => "1 kHz decentralized, us",
-                None => "1 kHz one way p50/p99, us",
+            match (stp_offset, tls) {
+                (Some(_), _) => "1 kHz decentralized, us",
+                (None, true) => "1 kHz one way TLS, us",
+                (None, false) => "1 kHz one way p50/p99, us",
             },
             &ours,
             &format!("tcp relay {}", quantiles(&floor)),
@@ -207,6 +216,7 @@ impl Settings {
             ],
             fast: true,
             stp_offset: None,
+            tls: false,
         };
         let mut fan_out = Case {
             name: "fan-out",
@@ -214,6 +224,7 @@ impl Settings {
             connections: Vec::new(),
             fast: true,
             stp_offset: None,
+            tls: false,
         };
         const SINKS: [&str; 10] = ["s0", "s1", "s2", "s3", "s4", "s5", "s6", "s7", "s8", "s9"];
         for (index, sink) in (1..).zip(SINKS) {
@@ -266,6 +277,15 @@ fn source_sink(messages: u64) -> Case {
         connections: vec![((0, "out", 0), (1, "input", 0), None)],
         fast: true,
         stp_offset: None,
+        tls: false,
+    }
+}
+
+fn source_sink_under_tls(messages: u64) -> Case {
+    Case {
+        name: "S1 under TLS",
+        tls: true,
+        ..source_sink(messages)
     }
 }
 
@@ -302,6 +322,7 @@ fn pipeline(messages: u64) -> Case {
         ],
         fast: true,
         stp_offset: None,
+        tls: false,
     }
 }
 
@@ -319,6 +340,7 @@ fn two_sources(messages: u64) -> Case {
         ],
         fast: true,
         stp_offset: None,
+        tls: false,
     }
 }
 

@@ -2,7 +2,6 @@
 
 use std::collections::BTreeSet;
 use std::io::Read;
-use std::sync::atomic::Ordering;
 use std::time::Duration;
 
 use ictus_deploy::Engine;
@@ -175,16 +174,12 @@ impl Host {
     /// as long again. Until then whoever comes next finds what was planned on.
     pub(crate) fn await_commit(&self, name: &str, id: &str) {
         let (host, name, id) = (self.clone(), name.to_owned(), id.to_owned());
-        self.0.awaited.fetch_add(1, Ordering::Relaxed);
-        tokio::spawn(async move {
-            host.abandon(&name, &id).await;
-            host.0.awaited.fetch_sub(1, Ordering::Relaxed);
-        });
+        tokio::spawn(async move { host.abandon(&name, &id).await });
     }
 
     async fn abandon(&self, name: &str, id: &str) {
         let (mut patience, mut alone) = (ABANDONED_AFTER, false);
-        while self.is_prepared(name, id) {
+        while self.prepared(name).as_deref() == Some(id) {
             let left = self.leases().left(self.since(), name);
             match left {
                 Some((left, whole)) => {
@@ -208,11 +203,6 @@ impl Host {
                 }
             }
         }
-    }
-
-    fn is_prepared(&self, name: &str, id: &str) -> bool {
-        let record = recorded(name, &self.directory(name)).ok().flatten();
-        record.is_some_and(|it| it.view.state == State::Prepared && it.view.id == id)
     }
 
     /// Ports that other federations of this host have, or will have when they are committed.
