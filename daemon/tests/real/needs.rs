@@ -2,6 +2,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs::{self, Permissions};
+use std::net::{Ipv4Addr, TcpListener};
 use std::os::unix::fs::{MetadataExt, PermissionsExt};
 use std::path::{Path, PathBuf};
 
@@ -11,7 +12,7 @@ use ictusd::api::secret::{SecretValue, SecretValues, StartCall};
 use ictusd::api::{ErrorCode, Event, Outcome, StartRequest, State};
 use ictusd::client::ClientError;
 
-use crate::world::{OWN_SOCKETS, Process, Started, World, fakes, federation, next, outcome};
+use crate::world::{BOUND, OWN_SOCKETS, Process, Started, World, fakes, federation, next, outcome};
 
 const NAME: &str = "fake";
 const CANARY: &str = "canary-3f1c";
@@ -110,7 +111,8 @@ async fn a_secret_is_a_file_in_memory_and_nowhere_else() {
         .find(|line| line.starts_with("Max core"))
         .unwrap();
     let words: Vec<_> = core.split_ascii_whitespace().collect();
-    assert_eq!(words[4..6], ["0", "0"], "{core}");
+    // 0 would not keep a pipe from getting it.
+    assert_eq!(words[4..6], ["1", "1"], "{core}");
     assert_eq!(holding(&world.paths.state, CANARY), Vec::<PathBuf>::new());
     // The same once more is nothing to do; another value is.
     let (code, _) = refused(&world, &call(CANARY)).await;
@@ -139,11 +141,23 @@ async fn without_its_secrets_a_run_waits_and_is_not_started() {
     let mut world = World::new().await;
     let mut only = call(CANARY);
     only.secrets = SecretValues::default();
+    let free = TcpListener::bind((Ipv4Addr::LOCALHOST, 0)).unwrap();
+    let address = free.local_addr().unwrap();
+    drop(free);
+    only.request.settings.metrics_listen = Some(address);
     let (_, message) = refused(&world, &only).await;
     assert!(
         message.contains("the value of secret `TOKEN` of federate `a` did not come"),
         "{message}"
     );
+    // Nor does it listen for a run that is not there.
+    let closed = async {
+        while TcpListener::bind(address).is_err() {
+            tokio::task::yield_now().await;
+        }
+    };
+    tokio::time::timeout(BOUND, closed).await.unwrap();
+    only.request = request();
     let started = start(&world, &call(CANARY)).await;
     let file = secret_file(&started);
     // As when the host loses its power: processes and memory are gone, the record is there.
@@ -186,7 +200,7 @@ async fn a_federate_runs_where_and_as_what_it_is_told() {
             needs.realtime = Some(Realtime {
                 policy: RealtimePolicy::RoundRobin,
                 priority: 7,
-                lock_memory: false,
+                lock_memory: gives.lock_memory.is_ok(),
             });
         }
         Err(denied) => skipped(&format!("realtime scheduling: {}", denied.why)),
@@ -224,6 +238,13 @@ async fn a_federate_runs_where_and_as_what_it_is_told() {
             .collect();
         // Fields 40 and 41 of stat(5): rt_priority and policy (SCHED_RR is 2).
         assert_eq!((fields[37], fields[38]), ("7", "2"), "{stat}");
+        if gives.uid == 0 && gives.lock_memory.is_ok() {
+            let limits = of_process(&started, "a", "limits");
+            let mut lines = limits.lines();
+            let locked = lines.find(|line| line.starts_with("Max locked memory"));
+            let words: Vec<_> = locked.unwrap().split_ascii_whitespace().collect();
+            assert_eq!(words[3..5], ["unlimited"; 2], "{limits}");
+        }
     }
     // Another user's process is stopped like any other.
     world.client.stop(NAME, false).await.unwrap();
