@@ -213,6 +213,7 @@ async fn a_federate_runs_where_and_as_what_it_is_told() {
         fs::copy(fakes(), &program).unwrap();
         request.federates[0].executable = program;
         request.federates[0].needs.user = Some("60007:60008".to_owned());
+        request.federates[1].needs.user = Some("0:60008".to_owned());
     } else {
         skipped("another user: this is not root");
     }
@@ -227,6 +228,9 @@ async fn a_federate_runs_where_and_as_what_it_is_told() {
         assert_eq!(line("Uid:"), "60007\t60007\t60007\t60007");
         assert_eq!(line("Gid:"), "60008\t60008\t60008\t60008");
         assert_eq!(line("Groups:"), "");
+        let status = of_process(&started, "b", "status");
+        let group = status.lines().find(|line| line.starts_with("Gid:"));
+        assert_eq!(group, Some("Gid:\t60008\t60008\t60008\t60008"));
     }
     if gives.realtime.is_ok() {
         let stat = of_process(&started, "a", "stat");
