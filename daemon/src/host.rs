@@ -522,6 +522,7 @@ fn unreadable_view(name: &str, directory: &Directory, error: &StoreError) -> Fed
                 member: None,
                 rank: 0,
                 what: format!("unreadable: {}", with_sources(error)),
+                reason: None,
                 lines: Vec::new(),
                 log: None,
                 at_ns: stamp::now_ns(),
