@@ -33,12 +33,17 @@ const PULL_MAX: Duration = Duration::from_secs(110);
 /// Bytes of a build's words that are kept for its error.
 const WORDS_BYTES_MAX: usize = 2000;
 
-/// The name of an image that was sent for a federation; absent when `id` is no `sha256:...`.
-pub(crate) fn sent_name(federation: &str, id: &str) -> Option<String> {
+/// The digits of an id `sha256:...` of an image or a layer.
+pub(crate) fn digits(id: &str) -> Option<&str> {
     let digits = id.strip_prefix("sha256:")?;
     let hexadecimal = |byte: u8| byte.is_ascii_digit() || (b'a'..=b'f').contains(&byte);
-    let is_digest = digits.len() == 64 && digits.bytes().all(hexadecimal);
-    is_digest.then(|| format!("{SENT}:{federation}-{}", &digits[..TAG_DIGITS]))
+    (digits.len() == 64 && digits.bytes().all(hexadecimal)).then_some(digits)
+}
+
+/// The name of an image that was sent for a federation; absent when `id` is no `sha256:...`.
+pub(crate) fn sent_name(federation: &str, id: &str) -> Option<String> {
+    let digits = digits(id)?;
+    Some(format!("{SENT}:{federation}-{}", &digits[..TAG_DIGITS]))
 }
 
 impl Engine {
