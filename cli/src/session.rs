@@ -362,7 +362,7 @@ fn failed(name: &str, failure: &Failure, was_healthy: bool) -> CliError {
     } else {
         "; everything was undone"
     };
-    let mut message = format!("{who}: {}{when}", failure.what);
+    let mut message = format!("{who}: {}{when}", failure.words());
     // Of a run that had been healthy the first words are not the last ones.
     let lines = if was_healthy { &[][..] } else { &failure.lines };
     for line in lines {

@@ -37,10 +37,15 @@ impl Account {
 /// The account that a manifest's `user` means on this host.
 ///
 /// # Errors
-/// Which user or group there is not, in words.
+/// Which user or group there is not, or what cannot be read, in words.
 pub(crate) fn find(user: &str) -> Result<Account, String> {
-    let read = |path| fs::read_to_string(path).unwrap_or_default();
-    resolve(user, &read("/etc/passwd"), &read("/etc/group"))
+    let read = |path: &str| match fs::read(path) {
+        Ok(bytes) => Ok(String::from_utf8_lossy(&bytes).into_owned()),
+        // Numbers need not stand anywhere.
+        Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(String::new()),
+        Err(error) => Err(format!("cannot read {path}: {error}")),
+    };
+    resolve(user, &read("/etc/passwd")?, &read("/etc/group")?)
 }
 
 /// The number of a group of this host, if there is such a one.
@@ -65,7 +70,8 @@ fn resolve(text: &str, passwd: &str, group: &str) -> Result<Account, String> {
         None => (text, None),
     };
     let number = |text: &str| text.parse::<u32>().ok();
-    let known = lines(passwd).find(|line| line[0] == user || number(line[2]) == number_of(user));
+    let is_it = |line: &str| number_of(user).is_some_and(|uid| number(line) == Some(uid));
+    let known = lines(passwd).find(|line| line[0] == user || is_it(line[2]));
     let uid = known
         .as_ref()
         .map_or_else(|| number(user), |line| number(line[2]));
@@ -109,6 +115,9 @@ fn lines(text: &str) -> impl Iterator<Item = Vec<&str>> {
 
 /// The first directory on the way to `path` that this account may not enter.
 pub(crate) fn closed_to(path: &Path, account: &Account) -> Option<PathBuf> {
+    if account.uid == 0 {
+        return None;
+    }
     let may_enter = |path: &Path| {
         let Ok(found) = path.metadata() else {
             return true;
@@ -137,8 +146,8 @@ mod tests {
 
     #[test]
     fn users_are_found_by_number_and_by_name() {
-        let passwd =
-            "root:x:0:0:root:/root:/bin/sh\nbob:x:1000:100:Bob:/home/bob:/bin/sh\nbroken\n";
+        // A line for NIS has no numbers.
+        let passwd = "root:x:0:0:root:/root:/bin/sh\n+::::::\nbob:x:1000:100:Bob:/home/bob:/bin/sh\nbroken\n";
         let group = "root:x:0:\nusers:x:100:\ndialout:x:20:ann,bob\naudio:x:29:ann\n";
         let bob = |gid| {
             Ok(Account {
@@ -188,6 +197,11 @@ mod tests {
             groups: Vec::new(),
         };
         assert_eq!(closed_to(&inner.join("x"), &stranger), Some(inner.clone()));
+        let root = Account {
+            uid: 0,
+            ..stranger.clone()
+        };
+        assert_eq!(closed_to(&inner.join("x"), &root), None);
         fs::set_permissions(&inner, fs::Permissions::from_mode(0o711)).unwrap();
         assert_eq!(closed_to(&inner.join("x"), &stranger), None);
     }

@@ -473,11 +473,10 @@ impl Agent {
             reason: reason.clone(),
         });
         if let Some(rank) = self.rank(id, &record.ending, premature) {
-            let what = match reason {
-                Some(reason) => format!("{how}: {reason}"),
-                None if !premature || !record.ending.success() => how,
-                None if starting => format!("{how} before the start"),
-                None => format!("{how} before its federates"),
+            let what = match premature && record.ending.success() && reason.is_none() {
+                false => how,
+                true if starting => format!("{how} before the start"),
+                true => format!("{how} before its federates"),
             };
             let at = Now {
                 wall_ns: record.ended_ns,
@@ -488,6 +487,7 @@ impl Agent {
                 now,
                 rank,
                 Failure {
+                    reason,
                     lines: record.first_lines.clone(),
                     ..failure
                 },

@@ -280,12 +280,26 @@ pub struct Failure {
     pub rank: u8,
     /// What happened, in words.
     pub what: String,
+    /// Why, in the member's own words, if it has said so.
+    #[serde(default)]
+    pub reason: Option<String>,
     /// The first lines that the member wrote.
     pub lines: Vec<String>,
     /// Its log file.
     pub log: Option<PathBuf>,
     /// When, nanoseconds since the Unix epoch.
     pub at_ns: i64,
+}
+
+impl Failure {
+    /// What happened, and why.
+    #[must_use]
+    pub fn words(&self) -> String {
+        match &self.reason {
+            Some(reason) => format!("{}: {reason}", self.what),
+            None => self.what.clone(),
+        }
+    }
 }
 
 /// The kinds of failure.

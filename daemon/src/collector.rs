@@ -18,12 +18,13 @@ use tokio::io::AsyncReadExt;
 use tokio::net::{TcpListener, UnixListener, UnixStream};
 use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::Semaphore;
+use tokio::time::sleep;
 
 use crate::agent::RTI;
 use crate::api::{ExitReason, FederationView, MemberView, State};
 use crate::files;
 use crate::metrics::{self, Snapshot};
-use crate::scrape::{self, Pages};
+use crate::scrape::{self, ACCEPT_PAUSE, Pages};
 use crate::supervisor::exit::Ending;
 use crate::supervisor::lines::Lines;
 
@@ -130,16 +131,21 @@ fn listen(path: &Path) -> Result<UnixListener, CollectorError> {
 
 async fn accept(socket: UnixListener, collector: Collector) {
     let slots = Arc::new(Semaphore::new(collector.federates() + MORE_CONNECTIONS));
-    // The semaphore is never closed; without a socket nobody can say anything.
+    // Never closed.
     while let Ok(slot) = slots.clone().acquire_owned().await {
-        let Ok((stream, _)) = socket.accept().await else {
-            return;
-        };
-        let collector = collector.clone();
-        tokio::spawn(async move {
-            collector.listen_to(stream).await;
-            drop(slot);
-        });
+        match socket.accept().await {
+            Ok((stream, _)) => {
+                let collector = collector.clone();
+                tokio::spawn(async move {
+                    collector.listen_to(stream).await;
+                    drop(slot);
+                });
+            }
+            Err(error) => {
+                tracing::warn!(%error, "cannot accept a federate");
+                sleep(ACCEPT_PAUSE).await;
+            }
+        }
     }
 }
 

@@ -34,7 +34,7 @@ mod tests;
 
 pub(crate) use error::EngineError;
 use error::{is_conflict, is_not_found};
-pub(crate) use images::{archive_of, sent_name};
+pub(crate) use images::{archive_of, digits, sent_name};
 pub(crate) use spec::{Binding, ContainerSpec, label};
 
 /// Where engines listen unless `DOCKER_HOST` says otherwise.

@@ -145,17 +145,28 @@ impl Host {
         self.check_driven(name)?;
         self.check_needs(&request)?;
         let metrics = self.listen(name, request.settings.metrics_listen)?;
-        let secrets = self.hand_over(name, &request, &secrets)?;
-        let told = self.0.told.clone();
-        let users = request.clone();
-        let begun = Federation::start(&self.0.paths, name, (request, metrics, secrets), told);
-        let (federation, handle) = begun.map_err(|error| {
+        let begun = self.begin(name, (request, metrics), &secrets);
+        let (federation, handle) = begun.inspect_err(|_| {
             self.remove_secrets(name).ok();
-            begin_error(&error)
+            self.listeners().release(name);
         })?;
-        self.admit_users(&self.directory(name), &users)?;
         self.spawn(name.to_owned(), federation, handle.clone());
         Ok(handle)
+    }
+
+    /// Lays down what a run needs; on an error its secrets may be there.
+    fn begin(
+        &self,
+        name: &str,
+        (request, metrics): (StartRequest, Option<SocketAddr>),
+        secrets: &SecretValues,
+    ) -> Result<(Federation, Handle), ApiError> {
+        let secrets = self.hand_over(name, &request, secrets)?;
+        let told = self.0.told.clone();
+        let begun = Federation::start(&self.0.paths, name, (request, metrics, secrets), told);
+        let (federation, handle) = begun.map_err(|error| begin_error(&error))?;
+        self.admit_users(&self.directory(name), &handle.request)?;
+        Ok((federation, handle))
     }
 
     /// What a start is told when the federation runs; `same` when its request is the same.
@@ -521,6 +532,7 @@ fn unreadable_view(name: &str, directory: &Directory, error: &StoreError) -> Fed
                 member: None,
                 rank: 0,
                 what: format!("unreadable: {}", with_sources(error)),
+                reason: None,
                 lines: Vec::new(),
                 log: None,
                 at_ns: stamp::now_ns(),

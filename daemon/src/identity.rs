@@ -1,9 +1,10 @@
 //! Who a process is. A pid alone is reused; pid, start time and pid namespace together are not.
 
 use std::fs;
-use std::io::{self, Read};
+use std::io;
 use std::os::unix::fs::MetadataExt;
 
+use ictus_deploy::image::hex;
 use serde::{Deserialize, Serialize};
 
 /// A process, told apart from every later one with the same pid.
@@ -69,11 +70,11 @@ impl ProcessIdentity {
 /// Makes a random id of 128 bits, as 32 hexadecimal digits.
 ///
 /// # Errors
-/// When `/dev/urandom` cannot be read.
+/// When the system has no random numbers.
 pub fn random_id() -> io::Result<String> {
     let mut bytes = [0_u8; 16];
-    fs::File::open("/dev/urandom")?.read_exact(&mut bytes)?;
-    Ok(bytes.iter().map(|byte| format!("{byte:02x}")).collect())
+    getrandom::fill(&mut bytes)?;
+    Ok(hex(&bytes))
 }
 
 /// Field 22 of a `stat` line; the command in field 2 may hold spaces and parentheses.

@@ -15,7 +15,7 @@ use tar::{Builder, EntryType, Header};
 use tempfile::NamedTempFile;
 use tokio::sync::mpsc;
 
-use crate::docker::{Engine, EngineError, Image, archive_of};
+use crate::docker::{Engine, EngineError, Image, archive_of, digits};
 
 /// The longest file of an archive that is read whole: a description, not a layer.
 const DESCRIPTION_BYTES_MAX: u64 = 16 << 20;
@@ -57,6 +57,17 @@ pub enum ImagesError {
         path: PathBuf,
         /// Why.
         source: io::Error,
+    },
+    /// The folder of an image has a file that leaves parts of it out, which is not heeded.
+    #[error(
+        "not everything in {} is for its image: its {name} is not heeded; build it yourself and write `image:`",
+        folder.display()
+    )]
+    Ignoring {
+        /// The folder.
+        folder: PathBuf,
+        /// The file.
+        name: String,
     },
     /// The engine's archive is not what it should be.
     #[error("the engine's archive of image {image} is not understood: {what}")]
@@ -127,6 +138,7 @@ impl Local {
         name: &str,
         (folder, dockerfile): (&Path, &str),
     ) -> Result<Found, ImagesError> {
+        wholly(folder, dockerfile)?;
         let (sender, pieces) = mpsc::channel(PIECES_MAX);
         let context = folder.to_path_buf();
         let archiving = tokio::task::spawn_blocking(move || {
@@ -175,6 +187,19 @@ impl Local {
             what: error.to_string(),
         })?
     }
+}
+
+/// Refuses a folder of which parts are to be left out.
+fn wholly(folder: &Path, dockerfile: &str) -> Result<(), ImagesError> {
+    let names = [
+        ".dockerignore".to_owned(),
+        format!("{dockerfile}.dockerignore"),
+    ];
+    let found = names.into_iter().find(|name| folder.join(name).exists());
+    found.map_or(Ok(()), |name| {
+        let folder = folder.to_path_buf();
+        Err(ImagesError::Ignoring { folder, name })
+    })
 }
 
 fn found(image: Image) -> Found {
@@ -373,12 +398,6 @@ fn path_of(layer: &str) -> String {
     format!("{}/layer.tar", digits(layer).unwrap_or("none"))
 }
 
-fn digits(id: &str) -> Option<&str> {
-    let digits = id.strip_prefix("sha256:")?;
-    let hexadecimal = digits.len() == 64 && digits.bytes().all(|it| it.is_ascii_hexdigit());
-    hexadecimal.then_some(digits)
-}
-
 /// A path without `.` and `..`, as text.
 fn plain(path: &Path) -> String {
     let mut parts: Vec<String> = Vec::new();
@@ -424,14 +443,13 @@ impl Write for Pieces<'_> {
 
 #[cfg(test)]
 mod tests {
+    use ictus_deploy::image::hex;
     use sha2::{Digest, Sha256};
 
     use super::*;
 
     fn id(bytes: &[u8]) -> String {
-        let digest = Sha256::digest(bytes);
-        let hex: String = digest.iter().map(|byte| format!("{byte:02x}")).collect();
-        format!("sha256:{hex}")
+        format!("sha256:{}", hex(&Sha256::digest(bytes)))
     }
 
     /// An archive as an engine writes it: the second layer is the first one again, as a link.
@@ -506,6 +524,22 @@ mod tests {
             described[0].layers,
             [path_of(&id(base)), path_of(&id(base)), layer]
         );
+    }
+
+    #[test]
+    fn a_folder_of_which_parts_are_left_out_is_refused() {
+        let folder = tempfile::tempdir().unwrap();
+        wholly(folder.path(), "Dockerfile").unwrap();
+        for name in ["x.dockerignore", ".dockerignore"] {
+            let path = folder.path().join(name);
+            std::fs::write(&path, "secret.key\n").unwrap();
+            let error = wholly(folder.path(), "x").unwrap_err().to_string();
+            assert!(
+                error.contains(&format!("its {name} is not heeded")),
+                "{error}"
+            );
+            std::fs::remove_file(path).unwrap();
+        }
     }
 
     #[test]

@@ -33,6 +33,7 @@ mod rescue;
 mod scrape;
 pub mod secrets;
 mod server;
+pub mod sockets;
 pub mod stamp;
 pub mod store;
 pub mod supervisor;

@@ -30,7 +30,7 @@ const REQUEST_MAX: Duration = Duration::from_secs(2);
 /// How long one connection may last: its one request, and a slow reader of the answer.
 const CONNECTION_MAX: Duration = Duration::from_secs(10);
 /// How long to wait before another connection is tried when the system is out of descriptors.
-const ACCEPT_PAUSE: Duration = Duration::from_millis(100);
+pub(crate) const ACCEPT_PAUSE: Duration = Duration::from_millis(100);
 
 /// The addresses that are listened on, and for whom.
 #[derive(Debug, Default)]

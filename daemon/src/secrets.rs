@@ -5,7 +5,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs::{self, DirBuilder, OpenOptions, Permissions};
-use std::io::{self, Read, Write};
+use std::io::{self, Write};
 use std::os::unix::ffi::OsStrExt;
 use std::os::unix::fs::{DirBuilderExt, MetadataExt, OpenOptionsExt, PermissionsExt, chown};
 use std::path::{Path, PathBuf};
@@ -13,6 +13,7 @@ use std::path::{Path, PathBuf};
 use hmac::{Hmac, KeyInit, Mac};
 use ictus_deploy::FederateRun;
 use ictus_deploy::gives::Denied;
+use ictus_deploy::image::hex;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 use zeroize::Zeroizing;
@@ -124,10 +125,7 @@ fn candidates(paths: &Paths, root: bool) -> Vec<PathBuf> {
     let state = Sha256::digest(paths.state.as_os_str().as_bytes());
     let uid = rustix::process::geteuid().as_raw();
     // Daemons of other state directories have others.
-    let shared = format!(
-        "ictus-{uid}-{:02x}{:02x}{:02x}",
-        state[0], state[1], state[2]
-    );
+    let shared = format!("ictus-{uid}-{}", hex(&state[..3]));
     let shared = Path::new(SHARED_MEMORY).join(shared);
     match root {
         // Nobody else could enter a run directory of root's.
@@ -282,7 +280,7 @@ fn key(path: &Path) -> io::Result<Key> {
         read => return read,
     }
     let mut key = Zeroizing::new(vec![0; KEY_BYTES]);
-    fs::File::open("/dev/urandom")?.read_exact(&mut key)?;
+    getrandom::fill(&mut key)?;
     let mut file = OpenOptions::new()
         .write(true)
         .create_new(true)
@@ -315,8 +313,7 @@ fn keyed(key: &Key, about: [&str; 3], value: &SecretValue) -> Option<Hmac<Sha256
 
 fn mac(key: &Key, about: [&str; 3], value: &SecretValue) -> String {
     let mac = keyed(key, about, value).map(|mac| mac.finalize().into_bytes());
-    let bytes = mac.iter().flatten();
-    bytes.map(|byte| format!("{byte:02x}")).collect()
+    mac.map(|bytes| hex(&bytes)).unwrap_or_default()
 }
 
 /// Compares in constant time.

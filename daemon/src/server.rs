@@ -17,6 +17,7 @@ use axum::response::{IntoResponse, Json, Response};
 use axum::routing::{get, post};
 use axum::serve::IncomingStream;
 use hyper::body::Frame;
+use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 use tokio::net::{UnixListener, UnixStream};
 use tokio::sync::{broadcast, mpsc, watch};
@@ -188,8 +189,7 @@ async fn start(
     Path(name): Path<String>,
     body: Bytes,
 ) -> Result<Response, ApiError> {
-    let call: StartCall =
-        serde_json::from_slice(&body).map_err(|error| bad_request(&error.to_string()))?;
+    let call: StartCall = parse(&body)?;
     let told = host.subscribe();
     let handle = host.start(&name, call)?;
     let (lines, body) = JsonLines::new(Some(StarterGuard(handle.commands)));
@@ -566,6 +566,10 @@ impl hyper::body::Body for JsonLines {
             .poll_recv(context)
             .map(|line| line.map(|line| Ok(Frame::data(line))))
     }
+}
+
+fn parse<T: DeserializeOwned>(body: &Bytes) -> Result<T, ApiError> {
+    serde_json::from_slice(body).map_err(|error| bad_request(&error.to_string()))
 }
 
 fn bad_request(message: &str) -> ApiError {

@@ -309,8 +309,8 @@ impl<'a> Writer<'a> {
             tmpfs: Line::of([TMP]),
             cap_drop: Line::of(["ALL"]),
             security_opt: Line::of(["no-new-privileges:true"]),
-            // A dump of memory would hold secrets.
-            ulimits: [("core", 0)].into(),
+            // A dump of memory would hold secrets; a pipe gets one in spite of 0, but not of 1 byte.
+            ulimits: [("core", 1)].into(),
             stop_grace_period: Some(span(settings.stop_grace)),
             logging: Logging::files(settings.log_max_size, settings.log_max_files),
             ..Service::default()

@@ -184,7 +184,7 @@ pub(crate) fn describe_outcome(outcome: &Outcome) -> String {
         }
         Outcome::Failed { failure, .. } => {
             let who = failure.member.as_deref().unwrap_or("the federation");
-            format!("failed: {who}: {}", one_line(&failure.what))
+            format!("failed: {who}: {}", one_line(&failure.words()))
         }
         Outcome::Aborted => "undone before it was healthy".to_owned(),
     }

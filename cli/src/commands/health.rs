@@ -4,6 +4,7 @@
 use std::fs;
 
 use clap::Args;
+use ictusd::sockets;
 
 use crate::error::CliError;
 
@@ -30,16 +31,7 @@ impl Health {
 
 /// Whether a table of the kernel's has a socket at a local port that listens or is connected.
 fn serves(table: &str, port: u16) -> bool {
-    const ESTABLISHED: &str = "01";
-    const LISTENING: &str = "0A";
-    let port = format!("{port:04X}");
-    table.lines().skip(1).any(|line| {
-        let mut fields = line.split_ascii_whitespace();
-        let (local, state) = (fields.nth(1), fields.nth(1));
-        let at = local.and_then(|local| local.rsplit_once(':'));
-        at.is_some_and(|(_, at)| at == port)
-            && state.is_some_and(|state| [ESTABLISHED, LISTENING].contains(&state))
-    })
+    sockets::of_table(table).any(|socket| socket.serves && socket.port == port)
 }
 
 #[cfg(test)]
@@ -48,10 +40,14 @@ mod tests {
 
     #[test]
     fn a_port_is_served_by_who_listens_or_is_connected() {
-        let table = "  sl  local_address rem_address   st tx_queue rx_queue\n   \
-            0: 0100007F:3AC5 00000000:0000 0A 00000000:00000000 00:00000000\n   \
-            1: 0100007F:1F90 0100007F:3AC5 01 00000000:00000000 00:00000000\n   \
-            2: 0100007F:0050 0100007F:3AC5 06 00000000:00000000 00:00000000\n";
+        let rest = "00000000:00000000 00:00000000 00000000 0 0 4711";
+        let table = format!(
+            "  sl  local_address rem_address   st tx_queue rx_queue\n   \
+            0: 0100007F:3AC5 00000000:0000 0A {rest}\n   \
+            1: 0100007F:1F90 0100007F:3AC5 01 {rest}\n   \
+            2: 0100007F:0050 0100007F:3AC5 06 {rest}\n"
+        );
+        let table = table.as_str();
         assert!(serves(table, 0x3AC5) && serves(table, 0x1F90));
         // The other end, one that is closing, and the heading.
         assert!(!serves(table, 0x50) && !serves(table, 1) && !serves("", 80));

@@ -307,7 +307,7 @@ fn state(view: &FederationView) -> String {
         (Some(Outcome::Aborted), _) => "not started".to_owned(),
         (Some(Outcome::Failed { failure, .. }), _) => {
             let who = failure.member.as_deref().unwrap_or("federation");
-            format!("failed: {who}: {}", one_line(&failure.what))
+            format!("failed: {who}: {}", one_line(&failure.words()))
         }
         (None, State::Prepared) => "prepared".to_owned(),
         (None, State::WaitingForSecrets) => "waiting for secrets".to_owned(),

@@ -47,7 +47,7 @@ pub(crate) fn ended(host: &str, outcome: &Outcome) -> Ended {
             let cause = Cause {
                 host: host.to_owned(),
                 step: String::new(),
-                what: format!("{who}{}", failure.what),
+                what: format!("{who}{}", failure.words()),
                 rank: failure.rank,
                 at_ns: failure.at_ns,
             };
@@ -107,7 +107,7 @@ pub(crate) fn headline(views: &[&FederationView]) -> Option<String> {
     let there = views.iter().find(ran).and_then(|view| view.part.as_ref());
     let host = &there.unwrap_or(part).host;
     let who = failure.member.as_deref().unwrap_or("federation");
-    let what = one_line(&failure.what);
+    let what = one_line(&failure.words());
     let name = &view.name;
     Some(format!(
         "federation `{name}` failed: host `{host}`: {who}: {what}"

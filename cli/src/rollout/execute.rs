@@ -663,7 +663,7 @@ fn ended(outcome: &api::Outcome) -> Outcome {
         api::Outcome::Failed { failure, .. } => {
             let who = failure.member.as_deref();
             let who = who.map_or_else(String::new, |who| format!("`{who}`: "));
-            let mut what = format!("{who}{}", failure.what);
+            let mut what = format!("{who}{}", failure.words());
             for line in &failure.lines {
                 what.push_str(&format!("\n  | {line}"));
             }

@@ -254,6 +254,23 @@ fn the_cause_is_the_headline_even_when_its_consequence_is_seen_first() {
 }
 
 #[test]
+fn a_federates_own_words_are_kept_apart_from_what_happened() {
+    let mut world = World::healthy();
+    let line = json!({
+        "event": "ended", "federate": "a", "elapsed_ns": 1, "microstep": 0, "code": 3, "reason": "no map"
+    });
+    world.on(A, MemberEvent::Reported { line });
+    world.ends(A, Ending::Exited { code: 3 });
+    world.ends(B, Ending::Exited { code: 11 });
+    world.ends(MemberId::Rti, Ending::Exited { code: 1 });
+    let Some(Outcome::Failed { failure, .. }) = world.agent.outcome() else {
+        panic!("{:?}", world.agent.outcome());
+    };
+    assert_eq!(failure.what, "exit code 3");
+    assert_eq!(failure.words(), "exit code 3: no map");
+}
+
+#[test]
 fn an_end_before_the_start_is_a_failure_even_with_code_0() {
     let mut world = World::start();
     world.started(MemberId::Rti);

@@ -33,12 +33,17 @@ const PULL_MAX: Duration = Duration::from_secs(110);
 /// Bytes of a build's words that are kept for its error.
 const WORDS_BYTES_MAX: usize = 2000;
 
-/// The name of an image that was sent for a federation; absent when `id` is no `sha256:...`.
-pub(crate) fn sent_name(federation: &str, id: &str) -> Option<String> {
+/// The digits of an id `sha256:...` of an image or a layer.
+pub(crate) fn digits(id: &str) -> Option<&str> {
     let digits = id.strip_prefix("sha256:")?;
     let hexadecimal = |byte: u8| byte.is_ascii_digit() || (b'a'..=b'f').contains(&byte);
-    let is_digest = digits.len() == 64 && digits.bytes().all(hexadecimal);
-    is_digest.then(|| format!("{SENT}:{federation}-{}", &digits[..TAG_DIGITS]))
+    (digits.len() == 64 && digits.bytes().all(hexadecimal)).then_some(digits)
+}
+
+/// The name of an image that was sent for a federation; absent when `id` is no `sha256:...`.
+pub(crate) fn sent_name(federation: &str, id: &str) -> Option<String> {
+    let digits = digits(id)?;
+    Some(format!("{SENT}:{federation}-{}", &digits[..TAG_DIGITS]))
 }
 
 impl Engine {
@@ -148,7 +153,7 @@ impl Engine {
     /// Loads an archive that comes piece by piece, compressed or not; the image has this name then.
     ///
     /// # Errors
-    /// When the engine does not take it, or it holds another image. What an archive leaves out must be there.
+    /// When the engine does not take it. What an archive leaves out must be there.
     pub(crate) async fn load_stream(
         &self,
         name: &str,
@@ -171,11 +176,15 @@ impl Engine {
         }
     }
 
-    /// Removes the names of images that were sent, but those that are needed; an image goes with its last name.
+    /// Removes the names of images that were sent, but those that are needed, which is asked at the last moment; an image
+    /// goes with its last name.
     ///
     /// # Errors
     /// When the engine does not tell which there are, or refuses one for another reason than that it is used.
-    pub(crate) async fn remove_sent(&self, needed: &[String]) -> Result<(), EngineError> {
+    pub(crate) async fn remove_sent(
+        &self,
+        needed: impl Fn(&str) -> bool,
+    ) -> Result<(), EngineError> {
         let filter = ("reference".to_owned(), vec![SENT.to_owned()]);
         let options = ListImagesOptions {
             filters: Some([filter].into()),
@@ -184,8 +193,8 @@ impl Engine {
         let images = self.docker.list_images(Some(options));
         let images = answer("list images".to_owned(), images).await?;
         let names = images.into_iter().flat_map(|image| image.repo_tags);
-        for name in names.filter(|name| !needed.contains(name)) {
-            if federation_of(&name).is_none() {
+        for name in names {
+            if federation_of(&name).is_none() || needed(&name) {
                 continue;
             }
             let options = RemoveImageOptions {
@@ -215,11 +224,14 @@ impl Engine {
         };
         let mut file = File::create(path).await.map_err(failed)?;
         let mut pieces = Box::pin(self.docker.export_image(image));
+        // The engine gathers the whole image before it says anything.
+        let mut patience = LOAD_MAX;
         loop {
-            match told(doing(), timeout(ANSWER_MAX, pieces.try_next()).await)? {
+            match told(doing(), timeout(patience, pieces.try_next()).await)? {
                 Some(piece) => file.write_all(&piece).await.map_err(failed)?,
                 None => return file.flush().await.map_err(failed),
             }
+            patience = ANSWER_MAX;
         }
     }
 

@@ -182,8 +182,8 @@ impl ContainerSpec {
             soft: Some(value),
             hard: Some(value),
         };
-        // A dump of memory would hold secrets.
-        let mut limits = vec![limit("core", 0)];
+        // A dump of memory would hold secrets; a pipe gets one in spite of 0, but not of 1 byte.
+        let mut limits = vec![limit("core", 1)];
         limits.extend(
             self.realtime
                 .map(|priority| limit("rtprio", priority.into())),
@@ -282,7 +282,7 @@ mod tests {
             .into_iter()
             .map(|it| (it.name.unwrap(), it.hard.unwrap()))
             .collect();
-        let expected = [("core", 0), ("rtprio", 10), ("memlock", -1)];
+        let expected = [("core", 1), ("rtprio", 10), ("memlock", -1)];
         assert_eq!(
             limits,
             expected.map(|(name, value)| (name.to_owned(), value))

@@ -2,7 +2,8 @@
 
 use std::fs;
 use std::io::{Read, Write};
-use std::os::unix::net::UnixListener;
+use std::os::unix::net::{UnixListener, UnixStream};
+use std::sync::mpsc;
 
 use ictus_deploy::image::ImageConfig;
 use tempfile::TempDir;
@@ -329,6 +330,60 @@ async fn an_engine_that_is_absent_stopped_or_not_ours_is_told_apart() {
         Path::new("/run/d.sock")
     );
     assert_eq!(socket(None).unwrap(), Path::new(SOCKET));
+}
+
+/// Answers as an engine with two images that were sent; gives what it is asked to remove.
+fn with_sent_images(listener: UnixListener) -> mpsc::Receiver<String> {
+    let (sender, removed) = mpsc::channel();
+    let answer = |request: &str| {
+        let image = |tag: &str| {
+            format!(
+                r#"{{"Id":"sha256:1","ParentId":"","RepoTags":["ictus-sent:f-{tag}"],"RepoDigests":[],"Created":0,
+                "Size":1,"SharedSize":0,"Labels":{{}},"Containers":0}}"#
+            )
+        };
+        match request {
+            request if request.contains("/version") => {
+                r#"{"Version":"28.0.0","ApiVersion":"1.48"}"#.to_owned()
+            }
+            request if request.contains("/info") => "{}".to_owned(),
+            request if request.starts_with("DELETE") => "[]".to_owned(),
+            _ => format!("[{},{}]", image(&"0".repeat(16)), image(&"1".repeat(16))),
+        }
+    };
+    let serve = move |mut stream: UnixStream, sender: mpsc::Sender<String>| {
+        let mut request = [0; 4096];
+        while let Ok(count @ 1..) = stream.read(&mut request) {
+            let request = String::from_utf8_lossy(&request[..count]);
+            let body = answer(&request);
+            if request.starts_with("DELETE") {
+                sender.send(request.into_owned()).unwrap();
+            }
+            write!(stream, "HTTP/1.1 200 OK\r\nContent-Type: application/json\r\nContent-Length: {}\r\n\r\n{body}", body.len())
+                .unwrap();
+        }
+    };
+    std::thread::spawn(move || {
+        for stream in listener.incoming() {
+            let sender = sender.clone();
+            std::thread::spawn(move || serve(stream.unwrap(), sender));
+        }
+    });
+    removed
+}
+
+#[tokio::test]
+async fn an_image_that_is_needed_meanwhile_is_not_removed() {
+    let directory = tempfile::tempdir().unwrap();
+    let path = directory.path().join("docker.sock");
+    let removed = with_sent_images(UnixListener::bind(&path).unwrap());
+    let engine = Engine::connect_to(&path).await.unwrap();
+    let asked = std::cell::Cell::new(0);
+    // A change begins after the first one went.
+    let needed = |_: &str| asked.replace(asked.get() + 1) > 0;
+    engine.remove_sent(needed).await.unwrap();
+    let removed: Vec<_> = removed.try_iter().collect();
+    assert_eq!((asked.get(), removed.len()), (2, 1), "{removed:?}");
 }
 
 #[tokio::test]

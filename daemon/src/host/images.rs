@@ -69,24 +69,26 @@ impl Host {
 
     /// Gives up images that were sent and that no run of this host needs; those of a change that is under way are needed.
     pub(crate) async fn collect_images(&self) {
-        if !self.lease_views().is_empty() {
-            return;
-        }
-        let mut needed = Vec::new();
-        for name in self.names() {
-            let request = self.directory(&name).read_request().ok();
-            let runs = request.into_iter().flat_map(|request| request.federates);
-            let mut images = self.history(&name).images();
-            images.extend(runs.filter_map(|run| run.needs.image));
-            needed.extend(images.iter().filter_map(|image| sent_name(&name, image)));
-        }
         // Where there is no engine there is no image either.
         let Ok(engine) = Engine::connect().await else {
             return;
         };
-        if let Err(error) = engine.remove_sent(&needed).await {
+        // A change may begin while others are removed.
+        let needed = |name: &str| !self.lease_views().is_empty() || self.needs_image(name);
+        if let Err(error) = engine.remove_sent(needed).await {
             tracing::warn!(%error, "images were not removed");
         }
+    }
+
+    /// Whether a run, or one that may be returned to, has an image that was sent under this name.
+    fn needs_image(&self, sent: &str) -> bool {
+        self.names().iter().any(|name| {
+            let request = self.directory(name).read_request().ok();
+            let runs = request.into_iter().flat_map(|request| request.federates);
+            let images = self.history(name).images().into_iter();
+            let mut images = images.chain(runs.filter_map(|run| run.needs.image));
+            images.any(|image| sent_name(name, &image).is_some_and(|name| name == sent))
+        })
     }
 }
 

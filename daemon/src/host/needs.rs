@@ -186,7 +186,8 @@ pub(crate) fn account(
         let message = format!("federate `{}`: {why}", run.name);
         error(ErrorCode::BadRequest, message)
     })?;
-    Ok(Some(found).filter(|found| found.uid != own))
+    // A group that is asked for is not the daemon's.
+    Ok(Some(found).filter(|found| found.uid != own || user.contains(':')))
 }
 
 fn set_mode(path: &Path, mode: u32) -> Result<(), ApiError> {

@@ -140,20 +140,28 @@ impl Host {
         let ports = ports::assign(part, request, &self.promised_ports(name));
         let ports = ports.map_err(|error| error_of(error.to_string()))?;
         self.settle(name);
-        let id = prepare.id.clone();
-        let secrets = self.hand_over(name, request, &prepare.secrets)?;
-        let prepared = Federation::prepare(self.paths(), name, request, id);
-        let (directory, mut record) = prepared.map_err(|error| {
+        let laid_down = self.lay_down(name, prepare, ports);
+        laid_down.inspect_err(|_| {
             self.remove_secrets(name).ok();
-            store_error(&error)
-        })?;
+        })
+    }
+
+    /// Writes what a part needs; on an error its secrets may be there.
+    fn lay_down(
+        &self,
+        name: &str,
+        prepare: &PrepareRequest,
+        ports: Assigned,
+    ) -> Result<Prepared, ApiError> {
+        let request = &prepare.request;
+        let secrets = self.hand_over(name, request, &prepare.secrets)?;
+        let prepared = Federation::prepare(self.paths(), name, request, prepare.id.clone());
+        let (directory, mut record) = prepared.map_err(|error| store_error(&error))?;
         record.secrets = secrets;
         for (member, papers) in &prepare.papers {
             let path = directory.papers(member);
-            papers.write(&path).map_err(|source| {
-                self.remove_secrets(name).ok();
-                store_error(&StoreError::Io { path, source })
-            })?;
+            let written = papers.write(&path);
+            written.map_err(|source| store_error(&StoreError::Io { path, source }))?;
         }
         self.admit_users(&directory, request)?;
         record.view.rti_port = ports.rti;
@@ -316,7 +324,8 @@ impl Host {
             ports::check(part, &assigned).map_err(|error| error_of(error.to_string()))?;
         }
         record.view.metrics = self.listen(name, request.settings.metrics_listen)?;
-        self.enter(name, &record, &request)?;
+        let entered = self.enter(name, &record, &request);
+        entered.inspect_err(|_| self.listeners().release(name))?;
         let told = self.0.told.clone();
         let state = (request, record, commit.rti);
         let (federation, handle) = Federation::begin(self.paths(), directory, state, told);

@@ -2,46 +2,27 @@
 
 use std::fs;
 use std::net::Ipv4Addr;
+use std::path::Path;
 
-/// A line of /proc/net/{tcp,udp}: a socket.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-struct Socket {
-    address: Ipv4Addr,
-    port: u16,
-    user: u32,
-    inode: u64,
-}
+use crate::sockets::{self, Socket};
 
 /// Who has this port of an address, in words; nothing when it cannot be seen.
 pub(super) fn holder(address: Ipv4Addr, port: u16) -> Option<String> {
-    let tables = ["/proc/net/tcp", "/proc/net/udp"].map(fs::read_to_string);
-    let lines: Vec<Socket> = tables
+    // A socket of IPv6 has the port, too, unless it is told otherwise.
+    let tables = ["tcp", "udp", "tcp6", "udp6"];
+    let tables = tables.map(|table| fs::read_to_string(Path::new("/proc/net").join(table)));
+    let mut sockets = tables
         .iter()
         .flatten()
-        .flat_map(|table| table.lines().filter_map(parse))
-        .collect();
-    let there = |socket: &&Socket| {
+        .flat_map(|table| sockets::of_table(table));
+    let there = |socket: &Socket| {
         socket.port == port
             && socket.inode != 0
             && (socket.address == address || socket.address.is_unspecified())
     };
-    let socket = lines.iter().find(there)?;
+    let socket = sockets.find(there)?;
     let process = process(socket.inode);
     Some(process.unwrap_or_else(|| format!("a process of user {}", socket.user)))
-}
-
-/// `  0: 0100007F:1F90 00000000:0000 0A 00000000:00000000 00:00000000 00000000  1000 0 4711 ...`
-fn parse(line: &str) -> Option<Socket> {
-    let mut words = line.split_ascii_whitespace();
-    let (address, port) = words.nth(1)?.split_once(':')?;
-    // As the machine stores it, so that its bytes in memory are in network order.
-    let address = u32::from_str_radix(address, 16).ok()?;
-    Some(Socket {
-        address: Ipv4Addr::from(address.to_ne_bytes()),
-        port: u16::from_str_radix(port, 16).ok()?,
-        user: words.nth(5)?.parse().ok()?,
-        inode: words.nth(1)?.parse().ok()?,
-    })
 }
 
 /// The process that has a socket open; only those of this user can be seen.
@@ -73,26 +54,14 @@ mod tests {
     use std::net::{TcpListener, UdpSocket};
 
     #[test]
-    fn a_line_is_a_socket() {
-        let line = "   3: 0100007F:1F90 00000000:0000 0A 00000000:00000000 00:00000000 00000000  1000        0 4711 1 0000 100 0 0 10 0";
-        let socket = parse(line).unwrap();
-        let (port, user, inode) = (8080, 1000, 4711);
-        assert_eq!(
-            (socket.port, socket.user, socket.inode),
-            (port, user, inode)
-        );
-        if cfg!(target_endian = "little") {
-            assert_eq!(socket.address, Ipv4Addr::LOCALHOST);
-        }
-        assert_eq!(parse("  sl  local_address rem_address   st"), None);
-    }
-
-    #[test]
     fn this_process_is_found() {
         let tcp = TcpListener::bind("127.0.0.1:0").unwrap();
         let udp = UdpSocket::bind("127.0.0.1:0").unwrap();
-        let ports = [tcp.local_addr(), udp.local_addr()].map(|it| it.unwrap().port());
-        for port in ports {
+        // Where the kernel has IPv6.
+        let wide = TcpListener::bind("[::]:0").ok();
+        let mut ports = vec![tcp.local_addr(), udp.local_addr()];
+        ports.extend(wide.as_ref().map(TcpListener::local_addr));
+        for port in ports.into_iter().map(|it| it.unwrap().port()) {
             let said = holder(Ipv4Addr::LOCALHOST, port).unwrap();
             let me = format!("process {}, ", std::process::id());
             assert!(said.starts_with(&me), "{said}");

@@ -11,7 +11,6 @@ use axum::response::{Json, Response};
 use axum::routing::{get, post, put};
 use futures_util::StreamExt;
 use serde::Deserialize;
-use serde::de::DeserializeOwned;
 use tokio::sync::mpsc;
 use tokio::time::timeout;
 
@@ -26,7 +25,7 @@ use crate::facts;
 use crate::federation::container::Images;
 use crate::host::Host;
 
-use super::{Caller, JsonLines, StarterGuard, bad_request, pass_until_end, stream};
+use super::{Caller, JsonLines, StarterGuard, bad_request, parse, pass_until_end, stream};
 
 /// How long the engine may take to say what it is, before a host is told without it.
 const ENGINE_MAX: Duration = Duration::from_secs(4);
@@ -221,10 +220,6 @@ async fn write_blob(
         known: Vec::new(),
     };
     writing.await.map_err(failed)?.map(Json)
-}
-
-fn parse<T: DeserializeOwned>(body: &Bytes) -> Result<T, ApiError> {
-    serde_json::from_slice(body).map_err(|error| bad_request(&error.to_string()))
 }
 
 /// What arrives, as a reader.

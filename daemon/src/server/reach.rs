@@ -4,14 +4,13 @@ use axum::Router;
 use axum::body::Bytes;
 use axum::response::Json;
 use axum::routing::post;
-use serde::de::DeserializeOwned;
 
 use crate::api::reach::{ListenRequest, Listening, ProbeRequest, Reached};
 use crate::api::{ApiError, ErrorCode};
 use crate::host::Host;
 use crate::reach::{self, ReachError};
 
-use super::bad_request;
+use super::parse;
 
 /// The routes.
 pub(super) fn router() -> Router<Host> {
@@ -28,10 +27,6 @@ async fn listen(body: Bytes) -> Result<Json<Listening>, ApiError> {
 async fn probe(body: Bytes) -> Result<Json<Reached>, ApiError> {
     let request: ProbeRequest = parse(&body)?;
     reach::probe(&request).await.map(Json).map_err(refused)
-}
-
-fn parse<T: DeserializeOwned>(body: &Bytes) -> Result<T, ApiError> {
-    serde_json::from_slice(body).map_err(|error| bad_request(&error.to_string()))
 }
 
 fn refused(error: ReachError) -> ApiError {

@@ -113,12 +113,50 @@ fn outcome(outcome: Outcome) -> Outcome {
             mut failure,
             was_healthy,
         } => {
-            failure.lines.clear();
+            (failure.reason, failure.lines) = (None, Vec::new());
             Outcome::Failed {
                 failure,
                 was_healthy,
             }
         }
         other @ (Outcome::Completed | Outcome::Stopped { .. } | Outcome::Aborted) => other,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::api::{Failure, FailureKind};
+
+    #[test]
+    fn what_a_federate_has_said_of_its_end_is_not_shown() {
+        let failed = Outcome::Failed {
+            failure: Failure {
+                kind: FailureKind::Process,
+                member: Some("a".to_owned()),
+                rank: 0,
+                what: "exit code 1".to_owned(),
+                reason: Some("canary".to_owned()),
+                lines: vec!["canary".to_owned()],
+                log: None,
+                at_ns: 0,
+            },
+            was_healthy: true,
+        };
+        let exited = Event::Exited {
+            member: "a".to_owned(),
+            how: "exit code 1".to_owned(),
+            reason: Some("canary".to_owned()),
+        };
+        for event in [Event::Ended { outcome: failed }, exited] {
+            let told = happening(Happening {
+                federation: "f".to_owned(),
+                at_ns: 0,
+                event,
+            });
+            let told = serde_json::to_string(&told).unwrap();
+            assert!(told.contains("exit code 1"), "{told}");
+            assert!(!told.contains("canary"), "{told}");
+        }
     }
 }

@@ -48,16 +48,29 @@ impl Limits {
             })?;
         }
         if self.no_core {
-            let nothing = Rlimit {
-                current: Some(0),
-                maximum: Some(0),
+            // A pipe in /proc/sys/kernel/core_pattern gets a core in spite of 0, but not of 1 byte (fs/coredump.c). Where no
+            // more than 0 is allowed, only root may have more.
+            let most = |bytes| Rlimit {
+                current: Some(bytes),
+                maximum: Some(bytes),
             };
-            rustix::process::setrlimit(Resource::Core, nothing)
+            let limit = |bytes| rustix::process::setrlimit(Resource::Core, most(bytes));
+            limit(1)
+                .or_else(|_| limit(0))
                 .map_err(|error| said("forbid core dumps")(error.into()))?;
         }
         if let Some(realtime) = self.realtime {
             let what = format!("get realtime priority {}", realtime.priority);
             schedule(realtime.policy, realtime.priority).map_err(said(&what))?;
+        }
+        // The capability to lock any amount goes with the user.
+        if self.account.is_some() && self.realtime.is_some_and(|it| it.lock_memory) {
+            let all = Rlimit {
+                current: None,
+                maximum: None,
+            };
+            rustix::process::setrlimit(Resource::Memlock, all)
+                .map_err(|error| said("let memory be locked")(error.into()))?;
         }
         match &self.account {
             Some(account) => become_user(account).map_err(said(&format!(

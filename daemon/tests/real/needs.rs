@@ -2,6 +2,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs::{self, Permissions};
+use std::net::{Ipv4Addr, TcpListener};
 use std::os::unix::fs::{MetadataExt, PermissionsExt};
 use std::path::{Path, PathBuf};
 
@@ -10,8 +11,9 @@ use ictus_deploy::placement::{Realtime, RealtimePolicy, SecretSource};
 use ictusd::api::secret::{SecretValue, SecretValues, StartCall};
 use ictusd::api::{ErrorCode, Event, Outcome, StartRequest, State};
 use ictusd::client::ClientError;
+use rustix::process::{Resource, Rlimit};
 
-use crate::world::{OWN_SOCKETS, Process, Started, World, fakes, federation, next, outcome};
+use crate::world::{BOUND, OWN_SOCKETS, Process, Started, World, fakes, federation, next, outcome};
 
 const NAME: &str = "fake";
 const CANARY: &str = "canary-3f1c";
@@ -110,7 +112,8 @@ async fn a_secret_is_a_file_in_memory_and_nowhere_else() {
         .find(|line| line.starts_with("Max core"))
         .unwrap();
     let words: Vec<_> = core.split_ascii_whitespace().collect();
-    assert_eq!(words[4..6], ["0", "0"], "{core}");
+    // 0 would not keep a pipe from getting it.
+    assert_eq!(words[4..6], ["1", "1"], "{core}");
     assert_eq!(holding(&world.paths.state, CANARY), Vec::<PathBuf>::new());
     // The same once more is nothing to do; another value is.
     let (code, _) = refused(&world, &call(CANARY)).await;
@@ -139,11 +142,23 @@ async fn without_its_secrets_a_run_waits_and_is_not_started() {
     let mut world = World::new().await;
     let mut only = call(CANARY);
     only.secrets = SecretValues::default();
+    let free = TcpListener::bind((Ipv4Addr::LOCALHOST, 0)).unwrap();
+    let address = free.local_addr().unwrap();
+    drop(free);
+    only.request.settings.metrics_listen = Some(address);
     let (_, message) = refused(&world, &only).await;
     assert!(
         message.contains("the value of secret `TOKEN` of federate `a` did not come"),
         "{message}"
     );
+    // Nor does it listen for a run that is not there.
+    let closed = async {
+        while TcpListener::bind(address).is_err() {
+            tokio::task::yield_now().await;
+        }
+    };
+    tokio::time::timeout(BOUND, closed).await.unwrap();
+    only.request = request();
     let started = start(&world, &call(CANARY)).await;
     let file = secret_file(&started);
     // As when the host loses its power: processes and memory are gone, the record is there.
@@ -177,6 +192,12 @@ async fn without_its_secrets_a_run_waits_and_is_not_started() {
 async fn a_federate_runs_where_and_as_what_it_is_told() {
     let world = World::new().await;
     let gives: Gives = world.client.host().await.unwrap().gives;
+    // Root of a container may perhaps not raise limits.
+    let unlimited = Rlimit {
+        current: None,
+        maximum: None,
+    };
+    let raised = rustix::process::setrlimit(Resource::Memlock, unlimited).is_ok();
     let mut request = federation(&[("a", ""), ("b", "")]);
     let cpu = *gives.cpus.last().unwrap();
     let needs = &mut request.federates[0].needs;
@@ -186,7 +207,7 @@ async fn a_federate_runs_where_and_as_what_it_is_told() {
             needs.realtime = Some(Realtime {
                 policy: RealtimePolicy::RoundRobin,
                 priority: 7,
-                lock_memory: false,
+                lock_memory: raised,
             });
         }
         Err(denied) => skipped(&format!("realtime scheduling: {}", denied.why)),
@@ -199,6 +220,7 @@ async fn a_federate_runs_where_and_as_what_it_is_told() {
         fs::copy(fakes(), &program).unwrap();
         request.federates[0].executable = program;
         request.federates[0].needs.user = Some("60007:60008".to_owned());
+        request.federates[1].needs.user = Some("0:60008".to_owned());
     } else {
         skipped("another user: this is not root");
     }
@@ -213,6 +235,12 @@ async fn a_federate_runs_where_and_as_what_it_is_told() {
         assert_eq!(line("Uid:"), "60007\t60007\t60007\t60007");
         assert_eq!(line("Gid:"), "60008\t60008\t60008\t60008");
         assert_eq!(line("Groups:"), "");
+        let status = of_process(&started, "b", "status");
+        let group = status.lines().find(|line| line.starts_with("Gid:"));
+        assert_eq!(group, Some("Gid:\t60008\t60008\t60008\t60008"));
+    }
+    if !raised {
+        skipped("memory that is locked: the limit cannot be raised");
     }
     if gives.realtime.is_ok() {
         let stat = of_process(&started, "a", "stat");
@@ -224,6 +252,13 @@ async fn a_federate_runs_where_and_as_what_it_is_told() {
             .collect();
         // Fields 40 and 41 of stat(5): rt_priority and policy (SCHED_RR is 2).
         assert_eq!((fields[37], fields[38]), ("7", "2"), "{stat}");
+        if gives.uid == 0 && raised {
+            let limits = of_process(&started, "a", "limits");
+            let mut lines = limits.lines();
+            let locked = lines.find(|line| line.starts_with("Max locked memory"));
+            let words: Vec<_> = locked.unwrap().split_ascii_whitespace().collect();
+            assert_eq!(words[3..5], ["unlimited"; 2], "{limits}");
+        }
     }
     // Another user's process is stopped like any other.
     world.client.stop(NAME, false).await.unwrap();

@@ -122,3 +122,15 @@ fn others() -> Service {
         ..Service::default()
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_said_twice_is_the_same() {
+        assert_eq!(SOCKET, format!("{SHARED}/{SOCKET_NAME}"));
+        let target = format!("[\"{COLLECTOR}:{COLLECTOR_PORT}\"]");
+        assert!(PROMETHEUS_CONFIG.contains(&target), "{PROMETHEUS_CONFIG}");
+    }
+}

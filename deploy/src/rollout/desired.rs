@@ -10,6 +10,7 @@ use serde_json::{Value, json};
 use sha2::{Digest, Sha256};
 
 use crate::check::{Checked, FederateRun, Settings};
+use crate::image::hex;
 use crate::placement::{Engine, HostSpec, Needs, Placement, SecretSource, Way};
 
 /// Hexadecimal digits of a facet's digest: enough to tell two apart, few enough to keep with every record.
@@ -397,8 +398,7 @@ fn milliseconds(span: Duration) -> u64 {
 pub(super) fn digest(value: &Value) -> String {
     let mut text = String::new();
     canonical(value, &mut text);
-    let hash = Sha256::digest(text.as_bytes());
-    hash.iter().map(|byte| format!("{byte:02x}")).collect()
+    hex(&Sha256::digest(text.as_bytes()))
 }
 
 /// Keys in order, whatever order `serde_json` was built to keep.

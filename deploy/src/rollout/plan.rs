@@ -206,13 +206,7 @@ pub fn plan_down(
     purge: bool,
     stop_limit_ms: u64,
 ) -> Result<Plan, Refusal> {
-    refuse(obstacles(
-        observed.keys(),
-        observed,
-        env!("CARGO_PKG_VERSION"),
-    ))?;
-    let mut plan = Plan::new(federation, None, planned_for(observed));
-    plan.stop_limit_ms = stop_limit_ms;
+    let mut plan = plan_nothing(federation, observed, stop_limit_ms)?;
     if purge || plan.runs.values().any(Option::is_some) {
         plan.causes = vec!["it is taken down".to_owned()];
         plan.steps = Graph::new(observed, stop_limit_ms).down(purge);
@@ -229,13 +223,7 @@ pub fn plan_stop(
     observed: &BTreeMap<String, Observed>,
     stop_limit_ms: u64,
 ) -> Result<Plan, Refusal> {
-    refuse(obstacles(
-        observed.keys(),
-        observed,
-        env!("CARGO_PKG_VERSION"),
-    ))?;
-    let mut plan = Plan::new(federation, None, planned_for(observed));
-    plan.stop_limit_ms = stop_limit_ms;
+    let mut plan = plan_nothing(federation, observed, stop_limit_ms)?;
     let steps = Graph::new(observed, stop_limit_ms).halt();
     let stops = |step: &Step| matches!(step.operation, Operation::StopOld { .. });
     if steps.iter().any(stops) {
@@ -243,6 +231,23 @@ pub fn plan_stop(
         plan.steps = steps;
     }
     Ok(plan)
+}
+
+/// A plan after which the federation is as it is, where it could be changed.
+fn plan_nothing(
+    federation: &str,
+    observed: &BTreeMap<String, Observed>,
+    stop_limit_ms: u64,
+) -> Result<Plan, Refusal> {
+    refuse(obstacles(
+        observed.keys(),
+        observed,
+        env!("CARGO_PKG_VERSION"),
+    ))?;
+    Ok(Plan {
+        stop_limit_ms,
+        ..Plan::new(federation, None, planned_for(observed))
+    })
 }
 
 impl Plan {

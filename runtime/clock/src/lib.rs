@@ -9,5 +9,5 @@ mod socket;
 
 pub use discipline::{Discipline, Sources};
 pub use host::{HostClock, Skew, StepWatch};
-pub use lookout::{Lookout, ask_often, give_up, other_host, traffic};
+pub use lookout::{Lookout, ask_often, give_up, other_host};
 pub use socket::{Arrival, Departure, ProbeSocket, Sent, Stamps};

@@ -670,9 +670,12 @@ fn a_federate_that_answers_no_probe_keeps_nobody_waiting() {
 #[test]
 fn federates_that_do_not_join_in_time_end_the_rti() {
     let options = Options {
-        join_timeout: Some(Duration::from_millis(50)),
+        join_timeout: Some(Duration::from_secs(1)),
         ..Options::new("test", 2)
     };
-    let server = Server::bind(&options, Status::default()).unwrap();
-    assert_eq!(server.run().unwrap(), 1);
+    let rti = serve(options);
+    let mut peer = rti.join(0, &[], &[]);
+    assert_eq!(peer.next().unwrap(), "Ack");
+    while peer.next().is_some() {}
+    assert_eq!(rti.ended(), 1);
 }

@@ -16,8 +16,7 @@ pub enum Member {
 
 impl Member {
     /// The name in its certificate: `rti.RUN.ictus` or `f3.RUN.ictus`; no two members of any two runs share one.
-    #[must_use]
-    pub fn name(self, run: &str) -> String {
+    pub(crate) fn name(self, run: &str) -> String {
         match self {
             Self::Rti => format!("rti.{run}.{DOMAIN}"),
             Self::Federate(id) => format!("f{id}.{run}.{DOMAIN}"),
@@ -25,8 +24,7 @@ impl Member {
     }
 
     /// The member and the run of a name; nothing when it is none of ours.
-    #[must_use]
-    pub fn of_name(name: &str) -> Option<(Self, &str)> {
+    pub(crate) fn of_name(name: &str) -> Option<(Self, &str)> {
         let (first, rest) = name.split_once('.')?;
         let run = rest.strip_suffix(DOMAIN)?.strip_suffix('.')?;
         let member = match first {

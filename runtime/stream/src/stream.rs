@@ -36,12 +36,6 @@ impl<T> Stream<T> {
         &mut self.tcp
     }
 
-    /// Whether it is in the clear.
-    #[must_use]
-    pub const fn is_plain(&self) -> bool {
-        self.tls.is_none()
-    }
-
     /// Whether both ends may write: in the clear always, else when they have shown who they are.
     #[must_use]
     pub fn is_open(&self) -> bool {
