@@ -370,7 +370,7 @@ fn failed(name: &str, failure: &Failure, was_healthy: bool) -> CliError {
     }
     let kind = match failure.kind {
         FailureKind::Timeout => Kind::Timeout,
-        FailureKind::Process | FailureKind::Foreign => Kind::Failed,
+        FailureKind::Process | FailureKind::Foreign | FailureKind::NewerRecord => Kind::Failed,
     };
     let error = CliError::new(kind, message);
     match &failure.log {
