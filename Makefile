@@ -14,7 +14,7 @@ setup:
 	@.ci/setup
 
 build: setup
-	$(CARGO) build --release --quiet --package ictus-cli
+	$(CARGO) build --release --package ictus-cli
 
 run: build
 	@ICTUS=$(ICTUS) .ci/show compose/autoware/federation.yaml

@@ -461,6 +461,20 @@ fn a_manifest_for_compose_is_started_shown_and_taken_down() {
     }
     let logs = sandbox.ok(&["logs", name, "rti"]);
     assert!(logs.contains("listening on port 15045"), "{logs}");
+    let views = sandbox.json(&["ps"]);
+    assert_eq!(views[0]["name"], name, "{views}");
+    assert_eq!(views[0]["state"], "compose", "{views}");
+    let refused = sandbox.fails(&["ps", name, "-o", "json"], 1);
+    assert!(refused.contains("shows it as text"), "{refused}");
+    let refused = sandbox.fails(&["ps", name, "--watch"], 1);
+    assert!(refused.contains("docker-compose"), "{refused}");
+    let refused = sandbox.fails(&["stop", name], 1);
+    assert!(refused.contains("docker-compose runs"), "{refused}");
+    // Its images stay until it is purged, by whatever it is called.
+    sandbox.ok(&["down", name]);
+    assert_eq!(sandbox.json(&["ps"]), serde_json::json!([]));
+    assert_eq!(project.left().len(), 1);
+    sandbox.ok(&["down", &manifest]);
     sandbox.ok(&["down", name, "--purge"]);
     assert_eq!(project.left(), Vec::<String>::new());
     let kept = fs::read_dir(sandbox.state().join("compose")).unwrap();

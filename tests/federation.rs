@@ -66,19 +66,23 @@ fn down_without_purge_leaves_the_last_logs_and_names_them() {
     );
 }
 
-#[test]
-fn a_realtime_federate_keeps_its_memory_and_its_secret() {
-    let sandbox = Sandbox::new();
+/// A federate with a secret, and with these keys besides.
+fn keeper(sandbox: &Sandbox, more: &str) -> String {
     let token = sandbox.state().join("token");
     std::fs::write(&token, "0123456789").unwrap();
     let text = format!(
         "ictus: v1\nfederation: kept\nprograms:\n  canary: {{ package: {} }}\nfederates:\n  keeper:\n    \
-         class: Keeper\n    parameters: {{ bytes: 10 }}\n    \
-         realtime: {{ policy: fifo, priority: 5, lock_memory: true }}\n    \
-         secrets: [{{ name: TOKEN, file: token }}]\n",
+         class: Keeper\n    parameters: {{ bytes: 10 }}\n    {more}secrets: [{{ name: TOKEN, file: token }}]\n",
         root().join("tests/canary").display()
     );
-    let manifest = sandbox.manifest("kept.yaml", &text);
+    sandbox.manifest("kept.yaml", &text)
+}
+
+#[test]
+fn a_realtime_federate_keeps_its_memory() {
+    let sandbox = Sandbox::new();
+    let realtime = "realtime: { policy: fifo, priority: 5, lock_memory: true }\n    ";
+    let manifest = keeper(&sandbox, realtime);
     let output = sandbox.run(&["up", &manifest]);
     let said = ictus_tests::said(&output);
     if !output.status.success() {
@@ -92,7 +96,15 @@ fn a_realtime_federate_keeps_its_memory_and_its_secret() {
     let locked = status.lines().find(|line| line.starts_with("VmLck:"));
     let locked = locked.unwrap().split_ascii_whitespace().nth(1).unwrap();
     assert!(locked.parse::<u64>().unwrap() > 1000, "{status}");
-    std::fs::write(&token, "9876543210").unwrap();
+    sandbox.ok(&["down", "kept", "--purge"]);
+}
+
+#[test]
+fn a_federate_has_its_secret_and_another_value_is_told() {
+    let sandbox = Sandbox::new();
+    let manifest = keeper(&sandbox, "");
+    sandbox.ok(&["up", &manifest]);
+    std::fs::write(sandbox.state().join("token"), "9876543210").unwrap();
     let said = sandbox.fails(&["up", &manifest], 1);
     let changed = "with another value of secret `TOKEN` of federate `keeper`";
     assert!(

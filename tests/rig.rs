@@ -88,6 +88,12 @@ impl Rig {
         rig
     }
 
+    /// What everything of it is called: no other work tree's is called so.
+    #[must_use]
+    pub fn name(&self) -> &str {
+        &self.name
+    }
+
     /// The hosts, in order.
     #[must_use]
     pub fn hosts(&self) -> &[Host] {

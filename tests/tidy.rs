@@ -122,6 +122,41 @@ fn dependencies(package: &Value) -> BTreeSet<&str> {
         .collect()
 }
 
+/// Every crate of others stands in exactly one row of ARCHITECTURE.md's table, and nothing else does.
+#[test]
+fn every_dependency_has_its_row() {
+    let manifest = fs::read_to_string(root().join("Cargo.toml")).unwrap();
+    let manifest: toml::Table = toml::from_str(&manifest).unwrap();
+    let dependencies = manifest["workspace"]["dependencies"].as_table().unwrap();
+    let others = dependencies
+        .iter()
+        .filter(|(_, how)| how.get("path").is_none());
+    let mut others: Vec<&str> = others.map(|(name, _)| name.as_str()).collect();
+    others.sort_unstable();
+    let text = fs::read_to_string(root().join("ARCHITECTURE.md")).unwrap();
+    let section = text
+        .split("\n## ")
+        .find(|it| it.starts_with("Dependencies\n"));
+    let rows = section
+        .unwrap()
+        .lines()
+        .filter(|line| line.starts_with("| `"));
+    let first = rows.map(|row| row.split('|').nth(1).unwrap());
+    // Words in backticks; what is in parentheses is a feature.
+    let names = first.flat_map(|cell| cell.split(", "));
+    let mut named: Vec<&str> = names
+        .map(|name| {
+            name.trim()
+                .trim_start_matches('`')
+                .split('`')
+                .next()
+                .unwrap()
+        })
+        .collect();
+    named.sort_unstable();
+    assert_eq!(named, others);
+}
+
 #[test]
 fn imports_follow_the_arrows() {
     let metadata = metadata();

@@ -6,6 +6,7 @@ use std::process::ExitCode;
 mod args;
 mod commands;
 mod error;
+mod files;
 mod history;
 mod hosts;
 mod interrupts;

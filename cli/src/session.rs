@@ -58,12 +58,14 @@ impl Session {
     /// The federation that is meant: by name, by manifest, or the only one there is.
     pub(crate) fn name(&self, given: Option<&str>) -> Result<String, CliError> {
         let known = self.known();
+        let stacks: Vec<_> = Stack::all(self).into_iter().map(|it| it.name).collect();
         let Some(given) = given else {
-            return match known.as_slice() {
-                [only] => Ok(only.clone()),
-                [] => Err(CliError::failed("there is no federation").hint(UP)),
+            return match (known.as_slice(), stacks.as_slice()) {
+                ([only], []) => Ok(only.clone()),
+                ([], []) => Err(CliError::failed("there is no federation").hint(UP)),
+                ([], [only]) => Err(of_compose(only)),
                 _ => Err(CliError::failed("there are several federations: say which")
-                    .hint(format!("known: {}", known.join(", ")))),
+                    .hint(format!("known: {}", [known, stacks].concat().join(", ")))),
             };
         };
         let is_path = given.contains('/') || given.ends_with(".yaml") || given.ends_with(".yml");
@@ -76,12 +78,21 @@ impl Session {
         if known.contains(&name) {
             return Ok(name);
         }
+        if stacks.contains(&name) {
+            return Err(of_compose(&name));
+        }
         let error = CliError::failed(format!("there is no federation `{name}`"));
         Err(match known.as_slice() {
             [] => error.hint(UP),
             _ => error.hint(format!("known: {}", known.join(", "))),
         })
     }
+}
+
+/// A command that is not for what docker-compose runs.
+fn of_compose(name: &str) -> CliError {
+    CliError::failed(format!("docker-compose runs `{name}`"))
+        .hint("`ictus ps`, `ictus logs` and `ictus down` are for it")
 }
 
 const UP: &str = "`ictus up MANIFEST` starts one";
@@ -126,6 +137,12 @@ impl Whereabouts {
     pub(crate) fn stack(&self, session: &Session, given: Option<&str>) -> Option<Stack> {
         let here = self.hosts.is_empty();
         here.then(|| stack::find(session, given)).flatten()
+    }
+
+    /// The same, or what is left of one that was taken down.
+    pub(crate) fn stack_or_left(&self, session: &Session, given: Option<&str>) -> Option<Stack> {
+        let left = || stack::find_left(session, given).filter(|_| self.hosts.is_empty());
+        self.stack(session, given).or_else(left)
     }
 
     /// The hosts that are meant, by `--host` or by a manifest with hosts; absent: this machine.
@@ -227,7 +244,7 @@ async fn check_here(session: &Session, clients: &[Client], name: &str) -> Result
 }
 
 /// A manifest as far as it can be known without building.
-fn unbuilt(manifest: &Path) -> Result<Checked, CliError> {
+pub(crate) fn unbuilt(manifest: &Path) -> Result<Checked, CliError> {
     let manifest = ManifestArgs {
         manifest: manifest.to_path_buf(),
         set: Vec::new(),
@@ -370,7 +387,7 @@ fn failed(name: &str, failure: &Failure, was_healthy: bool) -> CliError {
     }
     let kind = match failure.kind {
         FailureKind::Timeout => Kind::Timeout,
-        FailureKind::Process | FailureKind::Foreign => Kind::Failed,
+        FailureKind::Process | FailureKind::Foreign | FailureKind::NewerRecord => Kind::Failed,
     };
     let error = CliError::new(kind, message);
     match &failure.log {

@@ -8,15 +8,16 @@ use std::path::{Path, PathBuf};
 use std::process::{Output, Stdio};
 use std::time::Duration;
 
-use ictus_deploy::Checked;
 use ictus_deploy::compose::{Compose, ComposeOptions};
+use ictus_deploy::{Checked, Deploy};
 use ictusd::blobs;
 use ictusd::images::Local;
+use ictusd::store;
 use tokio::process::Command;
 
 use crate::commands::compose::{load, of, write};
 use crate::error::CliError;
-use crate::session::{Session, within};
+use crate::session::{Session, name_in, unbuilt, within};
 use crate::ui::Ui;
 
 /// How long docker-compose may take to say its version.
@@ -41,17 +42,28 @@ impl Stack {
 
     /// Those whose file is there, sorted.
     pub(crate) fn all(session: &Session) -> Vec<Self> {
+        let mut all = Self::known(session);
+        all.retain(Self::is_there);
+        all
+    }
+
+    /// Those that are there or have left something, sorted.
+    fn known(session: &Session) -> Vec<Self> {
         let entries = fs::read_dir(directory(session)).into_iter().flatten();
         let names = entries.filter_map(|entry| entry.ok()?.file_name().into_string().ok());
-        let mut all: Vec<_> = names.map(|name| Self::of(session, &name)).collect();
-        all.retain(Self::is_there);
-        all.sort_by(|a, b| a.name.cmp(&b.name));
-        all
+        let mut known: Vec<_> = names.map(|name| Self::of(session, &name)).collect();
+        known.sort_by(|a, b| a.name.cmp(&b.name));
+        known
     }
 
     /// Whether it was started and not taken down.
     pub(crate) fn is_there(&self) -> bool {
         self.file().is_file()
+    }
+
+    /// Whether anything of it is left, such as its images.
+    fn is_known(&self) -> bool {
+        self.directory.is_dir()
     }
 
     /// Where federates write their traces when they are to.
@@ -83,8 +95,11 @@ impl Stack {
         let started = within(limit, "docker-compose up", up).await;
         if let Err(error) = started {
             ui.stage("undoing", &self.name);
-            self.down(limit).await?;
-            return Err(error.hint("everything was undone"));
+            let undone = match self.down(limit).await {
+                Ok(()) => "everything was undone".to_owned(),
+                Err(also) => format!("it could not be undone: {also}"),
+            };
+            return Err(error.hint(undone));
         }
         ui.stage("started", &format!("by {}", tool.name()));
         Ok(())
@@ -108,8 +123,11 @@ impl Stack {
         Ok(())
     }
 
-    /// Stops and removes containers, network and volumes, and forgets the file.
+    /// Stops and removes containers, network and volumes, and forgets the file; does nothing when that was done.
     pub(crate) async fn down(&self, limit: Duration) -> Result<(), CliError> {
+        if !self.is_there() {
+            return Ok(());
+        }
         let tool = Tool::find().await?;
         let down = tool.run(self, &["down", "--volumes", "--remove-orphans"]);
         within(limit, "docker-compose down", down).await?;
@@ -133,7 +151,15 @@ impl Stack {
     }
 
     /// Runs a command that only shows something, on our own standard output.
-    pub(crate) async fn show(&self, arguments: &[impl AsRef<OsStr>]) -> Result<(), CliError> {
+    pub(crate) async fn show(
+        &self,
+        ui: &Ui,
+        arguments: &[impl AsRef<OsStr>],
+    ) -> Result<(), CliError> {
+        if ui.json() {
+            let message = format!("docker-compose runs `{}`, and shows it as text", self.name);
+            return Err(CliError::failed(message).hint("leave `-o json` out"));
+        }
         let tool = Tool::find().await?;
         let mut command = tool.command(self, arguments);
         let status = command.status().await.map_err(CliError::failed)?;
@@ -234,12 +260,10 @@ pub(crate) fn find(session: &Session, given: Option<&str>) -> Option<Stack> {
         Some(given) => {
             let path = Path::new(given);
             let by_name = Stack::of(session, given);
-            let is_name = !given.contains(['/', '.']) && by_name.is_there();
-            let name = || crate::session::name_in(path).ok();
-            if is_name {
+            if is_name(given) && by_name.is_there() {
                 by_name
             } else if path.exists() {
-                Stack::of(session, &name()?)
+                Stack::of(session, &name_in(path).ok()?)
             } else {
                 return None;
             }
@@ -250,4 +274,31 @@ pub(crate) fn find(session: &Session, given: Option<&str>) -> Option<Stack> {
         },
     };
     stack.is_there().then_some(stack)
+}
+
+/// The same for one that was taken down and not purged; the daemon's of that name goes before it.
+pub(crate) fn find_left(session: &Session, given: Option<&str>) -> Option<Stack> {
+    let known = session.known();
+    let stack = match given {
+        Some(given) if is_name(given) && Stack::of(session, given).is_known() => {
+            Stack::of(session, given)
+        }
+        Some(manifest) => {
+            let checked = unbuilt(Path::new(manifest)).ok()?;
+            if checked.deploy != Deploy::Compose {
+                return None;
+            }
+            Stack::of(session, &checked.plan.federation)
+        }
+        None => match Stack::known(session).as_slice() {
+            [only] if known.is_empty() => only.clone(),
+            _ => return None,
+        },
+    };
+    (stack.is_known() && !known.contains(&stack.name)).then_some(stack)
+}
+
+/// Whether it can be a name and not a path.
+fn is_name(given: &str) -> bool {
+    store::is_name(given) && !given.contains('.')
 }

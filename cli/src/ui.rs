@@ -117,6 +117,18 @@ impl Ui {
         }
     }
 
+    /// Says how many federates have reached a stage, once and for all when everybody has; tells whether that is so.
+    pub(crate) fn counted(&mut self, stage: &str, reached: usize, of: usize) -> bool {
+        let detail = format!("{reached}/{of} federates");
+        let all = reached >= of;
+        if all {
+            self.stage(stage, &detail);
+        } else {
+            self.progress(stage, &detail);
+        }
+        all
+    }
+
     /// Says something.
     pub(crate) fn message(&mut self, text: &str) {
         if !self.quiet {

@@ -312,6 +312,8 @@ pub enum FailureKind {
     Timeout,
     /// A record names a process that is not ours; it was not touched.
     Foreign,
+    /// A newer version wrote the record.
+    NewerRecord,
 }
 
 /// Something that happened to a federation.

@@ -528,7 +528,10 @@ fn unreadable_view(name: &str, directory: &Directory, error: &StoreError) -> Fed
         federates: Vec::new(),
         outcome: Some(Outcome::Failed {
             failure: Failure {
-                kind: FailureKind::Process,
+                kind: match error {
+                    StoreError::Newer { .. } => FailureKind::NewerRecord,
+                    StoreError::Io { .. } | StoreError::Damaged { .. } => FailureKind::Process,
+                },
                 member: None,
                 rank: 0,
                 what: format!("unreadable: {}", with_sources(error)),

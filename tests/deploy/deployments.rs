@@ -37,6 +37,10 @@ pub(crate) const SCENARIOS: &[Scenario] = &[
     ),
     ("a_wrong_key_is_said", a_wrong_key_is_said),
     (
+        "only_the_key_of_the_fingerprint_is_pinned",
+        only_the_key_of_the_fingerprint_is_pinned,
+    ),
+    (
         "a_changed_host_key_names_file_and_line",
         a_changed_host_key_names_file_and_line,
     ),
@@ -66,7 +70,7 @@ fn autoware_runs_in_containers_over_three_hosts(rig: &Rig) {
             hosts(rig, ", engine: docker")
         );
         let file = operator.manifest("autoware.yaml", &spread(rig, "autoware", &head));
-        let run = ["--set", "run=8 s"];
+        let run = ["--set", "run=15 s"];
         let planned = operator.run(&[&["plan", &file][..], &run].concat());
         assert_eq!(planned.status.code(), Some(2), "{}", said(&planned));
         let up = [&["up", &file, "--trace"][..], &run].concat();
@@ -132,7 +136,7 @@ fn the_diamond_runs_as_processes_over_three_hosts(rig: &Rig) {
 fn a_killed_daemon_of_a_host_adopts(rig: &Rig) {
     let operator = Operator::with_hosts(rig);
     let file = operator.manifest("diamond.yaml", &spread(rig, "diamond", &hosts(rig, "")));
-    operator.ok(&["up", &file, "--set", "run=12 s", "--trace"]);
+    operator.ok(&["up", &file, "--set", "run=20 s", "--trace"]);
     rig.hosts()[1].exec(&["pkill", "-KILL", "-f", "[i]ctusd daemon"]);
     let parts = operator.parts(&file);
     let running = |part: &Value| part["state"] == "running";
@@ -187,6 +191,33 @@ fn a_wrong_key_is_said(rig: &Rig) {
         said.contains("id_ed25519") || said.contains("key"),
         "{said}"
     );
+}
+
+fn only_the_key_of_the_fingerprint_is_pinned(rig: &Rig) {
+    let operator = Operator::new(rig);
+    let host = &rig.hosts()[0];
+    let at = target(host);
+    let known = operator.home.path().join(".ssh/known_hosts");
+    let wrong = format!("SHA256:{}", "A".repeat(43));
+    let said = operator.fails(&["host", "add", &at, "--fingerprint", &wrong], 4);
+    assert!(said.contains("is not trusted"), "{said}");
+    assert!(!known.exists(), "nothing is pinned");
+    let keys = Command::new("ssh-keygen")
+        .arg("-lf")
+        .arg(rig.known_hosts())
+        .output();
+    let keys = String::from_utf8(keys.unwrap().stdout).unwrap();
+    let address = host.address.to_string();
+    let mut lines = keys.lines().map(|line| line.split(' ').collect::<Vec<_>>());
+    let own = lines.find(|line| line[2] == address && line[3] == "(ED25519)");
+    let right = own.unwrap()[1];
+    operator.ok(&["host", "add", &at, "--fingerprint", right]);
+    let pinned = fs::read_to_string(&known).unwrap();
+    assert_eq!(pinned.lines().count(), 1, "{pinned}");
+    assert!(pinned.contains(" ssh-ed25519 "), "{pinned}");
+    let listed = operator.ok(&["host", "ls"]);
+    assert!(listed.contains(&at), "{listed}");
+    operator.remove(std::slice::from_ref(host));
 }
 
 fn a_changed_host_key_names_file_and_line(rig: &Rig) {

@@ -157,7 +157,8 @@ fn an_image_is_sent_without_a_registry_and_only_what_is_missing(rig: &Rig) {
     let operator = Operator::new(rig);
     operator.add(hosts);
     let workshop = Workshop::new(&operator);
-    let name = "ictus-gallery-viewer:test";
+    // The engine is that of all work trees.
+    let name = &format!("ictus-gallery-viewer:{}", operator.rig.name());
     workshop.build(name);
     let viewer = format!("image: \"{name}\", id: 1");
     let text = manifest(Some(&hosts[0]), &program_line(&operator), &viewer);

@@ -1,18 +1,15 @@
 //! `ictus compose`: a federation of one host for docker-compose, without a daemon.
 
-use std::fs;
-use std::io::{self, Write};
-use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 
 use clap::Args;
 use ictus_deploy::compose::{Compose, ComposeError, ComposeOptions};
 use ictus_deploy::{CheckOptions, Checked};
 use serde_json::json;
-use tempfile::Builder;
 
 use crate::args::ManifestArgs;
 use crate::error::{CliError, Kind};
+use crate::files::write_whole;
 use crate::rollout::size;
 use crate::session::{Session, checked_as};
 use crate::ui::Ui;
@@ -100,15 +97,8 @@ pub(crate) async fn load(ui: &mut Ui, compose: &Compose) -> Result<(), CliError>
 
 /// Writes a file whole or not at all.
 pub(crate) fn write(path: &Path, text: &str) -> Result<(), CliError> {
-    let parent = path.parent().filter(|it| !it.as_os_str().is_empty());
-    let written = || -> io::Result<()> {
-        let mut file = Builder::new()
-            .permissions(fs::Permissions::from_mode(0o666))
-            .tempfile_in(parent.unwrap_or(Path::new(".")))?;
-        file.write_all(text.as_bytes())?;
-        Ok(file.persist(path).map(drop)?)
-    };
-    written().map_err(|error| CliError::failed(format!("cannot write {}: {error}", path.display())))
+    write_whole(path, text.as_bytes(), 0o666)
+        .map_err(|error| CliError::failed(format!("cannot write {}: {error}", path.display())))
 }
 
 fn refused(error: ComposeError) -> CliError {

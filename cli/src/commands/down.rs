@@ -13,6 +13,7 @@ use crate::hosts::foreign;
 use crate::interrupts::Interrupts;
 use crate::rollout::{self, Executor, patience, size};
 use crate::session::{Abroad, Session, Whereabouts, within};
+use crate::stack::Stack;
 use crate::ui::Ui;
 
 /// Stop a federation and remove all but its logs and generations, which it names
@@ -34,15 +35,8 @@ impl Down {
     pub(crate) fn run(&self, ui: &mut Ui) -> Result<(), CliError> {
         let session = Session::new()?;
         let given = self.name.as_deref();
-        if let Some(stack) = self.at.stack(&session, given) {
-            return session.block_on(async {
-                stack.down(self.timeout).await?;
-                if self.purge {
-                    stack.purge().await?;
-                }
-                ui.stage("down", &stack.name);
-                Ok(())
-            });
+        if let Some(stack) = self.at.stack_or_left(&session, given) {
+            return session.block_on(self.stack(ui, &stack));
         }
         if let Some(abroad) = self.at.abroad(&session, given)? {
             return session.block_on(self.everywhere(ui, &session, &abroad));
@@ -68,6 +62,22 @@ impl Down {
             client.end().await?;
             Ok(())
         })
+    }
+
+    /// The same of one that docker-compose runs, or ran.
+    async fn stack(&self, ui: &mut Ui, stack: &Stack) -> Result<(), CliError> {
+        stack.down(self.timeout).await?;
+        if self.purge {
+            stack.purge().await?;
+        }
+        ui.stage("down", &stack.name);
+        if !self.purge {
+            let name = &stack.name;
+            ui.message(&format!(
+                "`ictus down {name} --purge` removes its images and traces"
+            ));
+        }
+        Ok(())
     }
 
     /// The same on every host on which it has a part.

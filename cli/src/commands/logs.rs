@@ -31,7 +31,7 @@ impl Logs {
         let session = Session::new()?;
         let first = self.names.first().map(String::as_str);
         if let Some(stack) = self.at.stack(&session, first) {
-            return session.block_on(stack.show(&self.of_stack()));
+            return session.block_on(stack.show(ui, &self.of_stack()));
         }
         if let Some(abroad) = self.at.abroad(&session, first)? {
             return session.block_on(self.everywhere(ui, &session, &abroad));

@@ -12,6 +12,7 @@ use crate::error::{CliError, Kind};
 use crate::hosts::outcome::headline;
 use crate::hosts::{Clients, connect_all, foreign};
 use crate::session::{Abroad, Session, Whereabouts, ago};
+use crate::stack::Stack;
 use crate::ui::{Table, Ui, nanoseconds, one_line};
 
 /// How often `--watch` looks.
@@ -33,15 +34,26 @@ impl Ps {
     pub(crate) fn run(&self, ui: &mut Ui) -> Result<(), CliError> {
         let session = Session::new()?;
         let given = self.name.as_deref();
-        if let Some(stack) = self.at.stack(&session, given) {
-            return session.block_on(stack.show(&["ps"]));
+        let stack = self.at.stack(&session, given);
+        let listed = given.is_none() && (self.watch || ui.json());
+        if let Some(stack) = stack.filter(|_| !listed) {
+            if self.watch {
+                let message = "`--watch` is not for a federation that docker-compose runs";
+                return Err(CliError::failed(message).hint("leave it out"));
+            }
+            return session.block_on(stack.show(ui, &["ps"]));
         }
         if let Some(abroad) = self.at.abroad(&session, given)? {
             return session.block_on(self.everywhere(ui, &session, &abroad));
         }
         let only = given.map(|given| session.name(Some(given))).transpose()?;
+        // By its name one is shown above.
+        let stacks = || match given {
+            None => Stack::all(&session),
+            Some(_) => Vec::new(),
+        };
         if !self.watch && session.known().is_empty() {
-            return show(ui, &[]);
+            return show(ui, &[], &stacks());
         }
         session.block_on(async {
             let client = session.daemon().await?;
@@ -51,7 +63,7 @@ impl Ps {
                 if self.watch && ui.can_redraw() {
                     ui.clear()?;
                 }
-                show(ui, &views)?;
+                show(ui, &views, &stacks())?;
                 if !self.watch {
                     return Ok(());
                 }
@@ -238,15 +250,40 @@ fn since(heard_ns: Option<i64>) -> String {
     )
 }
 
-fn show(ui: &mut Ui, views: &[FederationView]) -> Result<(), CliError> {
-    if views.is_empty() && !ui.json() {
+/// A federation that docker-compose runs, for programs: only its name is known without asking Compose.
+#[derive(Serialize)]
+struct Composed<'a> {
+    name: &'a str,
+    state: &'static str,
+}
+
+/// What one list holds.
+#[derive(Serialize)]
+#[serde(untagged)]
+enum Listed<'a> {
+    Ours(&'a FederationView),
+    Composed(Composed<'a>),
+}
+
+fn show(ui: &mut Ui, views: &[FederationView], stacks: &[Stack]) -> Result<(), CliError> {
+    if views.is_empty() && stacks.is_empty() && !ui.json() {
         ui.message("no federation; `ictus up MANIFEST` starts one");
         return Ok(());
     }
-    ui.result(&views, || {
+    let composed = stacks.iter().map(|stack| Composed {
+        name: &stack.name,
+        state: "compose",
+    });
+    let all = views.iter().map(Listed::Ours);
+    let all: Vec<_> = all.chain(composed.map(Listed::Composed)).collect();
+    ui.result(&all, || {
         let mut table = head();
         for view in views {
             rows(&mut table, view);
+        }
+        for Stack { name, .. } in stacks {
+            let state = format!("docker-compose runs it: `ictus ps {name}`");
+            table.row([name.clone(), "-".to_owned(), state]);
         }
         table.text()
     })

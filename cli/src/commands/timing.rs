@@ -1,5 +1,6 @@
 //! `ictus timing`: what the manifest's `timing` asks of a run, and declared bounds beside measured ones.
 
+use std::collections::BTreeMap;
 use std::fs;
 use std::path::Path;
 use std::time::Duration;
@@ -117,17 +118,19 @@ impl Timing {
         let name = &abroad.name;
         let mut copied = Copied::new(&clients, name).await?;
         if self.suggest {
-            let measures = all_measures(&clients, name).await?;
-            let found = self.suggestion(&copied.plan, || Ok(measures))?;
+            let measures = each_measures(&clients, name).await?;
+            let found = self.suggestion(&copied.plan, || Ok(all(name, measures)))?;
             return ui.result(&found, || found.to_string());
         }
         loop {
             copied.update(&clients, FileKind::Timing).await?;
-            let measures = all_measures(&clients, name).await?;
+            let measures = each_measures(&clients, name).await?;
+            let clocks = ClockBounds::of(&measures);
             let files = copied.path(FileKind::Timing);
+            let about = (&copied.plan, &copied.timing);
             let answer = Answer {
-                clocks: ClockBounds::ask(&clients, name).await?,
-                ..Answer::of(&files, (&copied.plan, &copied.timing), || Ok(measures))?
+                clocks,
+                ..Answer::of(&files, about, || Ok(all(name, measures)))?
             };
             self.show(ui, &answer)?;
             if !self.watch {
@@ -244,16 +247,25 @@ fn of_last_run(session: &Session, name: Option<&str>) -> Result<Answer, CliError
     })
 }
 
-/// What the federates of all hosts have measured.
-async fn all_measures(clients: &Clients, name: &str) -> Result<FederationMeasures, CliError> {
-    let mut all = FederationMeasures {
-        federation: name.to_owned(),
-        federates: Vec::new(),
-    };
-    for client in clients.values() {
-        all.federates.extend(client.measures(name).await?.federates);
+/// What the federates have measured, by host.
+async fn each_measures(
+    clients: &Clients,
+    name: &str,
+) -> Result<BTreeMap<String, FederationMeasures>, CliError> {
+    let mut measures = BTreeMap::new();
+    for (host, client) in clients {
+        measures.insert(host.clone(), client.measures(name).await?);
     }
-    Ok(all)
+    Ok(measures)
+}
+
+/// The same of all hosts as one.
+fn all(name: &str, measures: BTreeMap<String, FederationMeasures>) -> FederationMeasures {
+    let federates = measures.into_values().flat_map(|it| it.federates);
+    FederationMeasures {
+        federation: name.to_owned(),
+        federates: federates.collect(),
+    }
 }
 
 /// What the federates have measured, from the daemon.

@@ -30,8 +30,9 @@ const UNDO_MAX: Duration = Duration::from_secs(30);
 
 /// Start a federation; returns when it is healthy
 ///
-/// Checks and builds, starts the RTI and every federate as a process of this machine, and reports each stage from what
-/// they say themselves. Ctrl-C before it is healthy undoes everything.
+/// Checks and builds, starts the RTI and every federate where the manifest says, and reports each stage from what they
+/// say themselves: processes of this machine, processes or containers of its `hosts`, or services of docker-compose.
+/// Ctrl-C before it is healthy undoes everything.
 #[derive(Debug, Args)]
 pub(crate) struct Up {
     #[command(flatten)]
@@ -509,8 +510,8 @@ impl Stages {
                 );
                 (Stage::Started, true)
             }
-            Stage::Started => (Stage::Joined, counted(ui, "started", self.started, self.of)),
-            Stage::Joined => (Stage::Agreed, counted(ui, "joined", self.joined, self.of)),
+            Stage::Started => (Stage::Joined, ui.counted("started", self.started, self.of)),
+            Stage::Joined => (Stage::Agreed, ui.counted("joined", self.joined, self.of)),
             Stage::Agreed => {
                 let Some(start_ns) = self.start_ns else {
                     return false;
@@ -523,7 +524,7 @@ impl Stages {
             }
             Stage::Running => {
                 let (running, of) = self.running;
-                (Stage::Done, counted(ui, "running", running, of))
+                (Stage::Done, ui.counted("running", running, of))
             }
             Stage::Done => return false,
         };
@@ -532,15 +533,4 @@ impl Stages {
         }
         reached
     }
-}
-
-/// A stage that is reached when everybody has reached it; tells whether it is.
-fn counted(ui: &mut Ui, stage: &str, reached: usize, of: usize) -> bool {
-    let detail = format!("{reached}/{of} federates");
-    if reached < of {
-        ui.progress(stage, &detail);
-    } else {
-        ui.stage(stage, &detail);
-    }
-    reached >= of
 }

@@ -6,8 +6,6 @@ use std::fmt;
 use ictusd::api::FederationMeasures;
 use serde::Serialize;
 
-use super::Clients;
-use crate::error::CliError;
 use crate::ui::nanoseconds;
 
 /// The bounds of the hosts' clocks, where there are several.
@@ -40,15 +38,6 @@ impl ClockBounds {
             between_ns: all_known.then_some(worst),
             hosts,
         })
-    }
-
-    /// Asks every host.
-    pub(crate) async fn ask(clients: &Clients, name: &str) -> Result<Option<Self>, CliError> {
-        let mut measures = BTreeMap::new();
-        for (host, client) in clients {
-            measures.insert(host.clone(), client.measures(name).await?);
-        }
-        Ok(Self::of(&measures))
     }
 }
 

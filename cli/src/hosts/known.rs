@@ -8,6 +8,7 @@ use ictus_deploy::placement::SshClient;
 use serde::{Deserialize, Serialize};
 
 use crate::error::CliError;
+use crate::files::write_whole;
 
 /// How an added host is reached, by how it was named.
 pub(crate) type Known = BTreeMap<String, KnownHost>;
@@ -53,12 +54,8 @@ pub(crate) fn change(state: &Path, change: impl FnOnce(&mut Known)) -> Result<()
         .mode(0o700)
         .create(state)
         .map_err(failed)?;
-    let mut whole = tempfile::NamedTempFile::new_in(state).map_err(failed)?;
-    serde_json::to_writer_pretty(&mut whole, &known).map_err(|error| unusable(&path, &error))?;
-    whole
-        .persist(&path)
-        .map_err(|error| unusable(&path, &error))?;
-    Ok(())
+    let text = serde_json::to_vec_pretty(&known).map_err(|error| unusable(&path, &error))?;
+    write_whole(&path, &text, 0o600).map_err(failed)
 }
 
 fn file(state: &Path) -> PathBuf {

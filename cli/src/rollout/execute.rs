@@ -111,12 +111,11 @@ impl Executor {
         let secrets = std::mem::take(&mut rollout.secrets).complete()?;
         let mut requests = BTreeMap::new();
         for (host, wanted) in &rollout.desired.hosts {
-            let previous = None;
             let Some(request) = rollout.part_request(host) else {
                 continue;
             };
             let prepare = PrepareRequest {
-                previous,
+                previous: None,
                 id: run.clone(),
                 digest: rollout.desired.digest.clone(),
                 facets: rollout.desired.facets.clone(),

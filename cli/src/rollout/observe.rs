@@ -6,7 +6,7 @@ use ictus_deploy::rollout::{
     Desired, Held, MemberState, NewerRecord, Observed, Reached, Run, RunState,
 };
 use ictusd::api::secret::SecretValues;
-use ictusd::api::{ErrorCode, ExitReason, FederationView, MemberView, Outcome, State};
+use ictusd::api::{ErrorCode, ExitReason, FailureKind, FederationView, MemberView, Outcome, State};
 use ictusd::client::{Client, ClientError};
 
 use super::ObservedHosts;
@@ -133,8 +133,7 @@ pub(super) fn is_unknown(error: &ClientError) -> bool {
 
 fn run(view: &FederationView) -> Result<Run, NewerRecord> {
     if let Some(Outcome::Failed { failure, .. }) = &view.outcome
-        && failure.what.starts_with("unreadable: ")
-        && failure.what.contains("is of protocol")
+        && failure.kind == FailureKind::NewerRecord
     {
         return Err(NewerRecord {
             what: failure.what.clone(),

@@ -7,6 +7,7 @@ use ictus_deploy::rollout::{Plan, Stale};
 use serde::{Deserialize, Serialize};
 
 use crate::error::{CliError, Kind};
+use crate::files::write_whole;
 
 /// A plan with what it was made from.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -26,7 +27,7 @@ pub(crate) struct SavedPlan {
 impl SavedPlan {
     pub(crate) fn write(&self, path: &Path) -> Result<(), CliError> {
         let text = serde_json::to_vec_pretty(self).map_err(CliError::failed)?;
-        std::fs::write(path, text).map_err(|error| unusable(path, &error))
+        write_whole(path, &text, 0o666).map_err(|error| unusable(path, &error))
     }
 
     pub(crate) fn read(path: &Path) -> Result<Self, CliError> {

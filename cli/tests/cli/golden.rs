@@ -59,6 +59,55 @@ fn there_is_nothing() {
 }
 
 #[test]
+fn what_compose_runs_is_listed_and_told_apart() {
+    let environment = Environment::new();
+    for name in ["one", "two"] {
+        let directory = environment.state().join("compose").join(name);
+        fs::create_dir_all(&directory).unwrap();
+        fs::write(directory.join("compose.yaml"), "services: {}\n").unwrap();
+    }
+    check("stacks", &environment, &["ps"]);
+    check("stacks_json", &environment, &["ps", "-o", "json"]);
+    check("stack_json", &environment, &["ps", "one", "-o", "json"]);
+    check("stack_watch", &environment, &["ps", "one", "--watch"]);
+    check("which_stack", &environment, &["down"]);
+    check("not_for_a_stack", &environment, &["stop", "two"]);
+    // Taken down, and known by its name as long as its directory is there.
+    fs::remove_file(environment.state().join("compose/one/compose.yaml")).unwrap();
+    check("stack_is_down", &environment, &["down", "one"]);
+    let nobody = environment.run(&["down", "", "--purge"]);
+    assert_eq!(nobody.code, 1, "{nobody}");
+    assert!(environment.state().join("compose/one").exists());
+}
+
+#[test]
+fn hosts_are_listed_and_the_unit_printed() {
+    let environment = Environment::new();
+    let listed = environment.run(&["host", "ls"]).ok();
+    assert!(
+        listed.out.is_empty() && listed.err.contains("host add"),
+        "{listed}"
+    );
+    let list = r#"{ "ann@nuc": { "client": "ssh2" }, "bob@pi": { "client": "system", "identity": "/k" } }"#;
+    fs::create_dir(environment.state()).unwrap();
+    fs::write(environment.state().join("hosts.json"), list).unwrap();
+    let listed = environment.run(&["host", "ls"]).ok();
+    let lines: Vec<_> = listed
+        .out
+        .lines()
+        .map(|line| line.split_whitespace().collect::<Vec<_>>())
+        .collect();
+    assert_eq!(lines[0], ["HOST", "BY", "KEY"]);
+    assert_eq!(lines[1], ["ann@nuc", "ssh2", "-"]);
+    assert_eq!(lines[2], ["bob@pi", "the", "system's", "ssh", "/k"]);
+    let unit = environment.run(&["host", "unit"]).ok();
+    assert!(
+        unit.out.contains("\n[Service]\n") && unit.out.contains("\nExecStart="),
+        "{unit}"
+    );
+}
+
+#[test]
 fn mistakes_of_a_manifest() {
     let environment = Environment::new();
     let text = "ictus: v1\nfederation: bad\nfederates:\n  a: { clas: A }\nconections: []\n";

@@ -155,7 +155,7 @@ fn not_healthy_in_time_exits_with_6() {
     let text = PAIR.replace("class: Sink", "class: Sink, env: { FIXTURE: hang }");
     environment.write(
         "hang.yaml",
-        &format!("{text}defaults: {{ join_timeout: 500 ms }}\n"),
+        &format!("{text}defaults: {{ join_timeout: 5 s }}\n"),
     );
     let up = environment.run(&["up", "hang.yaml"]);
     assert_eq!(up.code, 6, "{up}");

@@ -151,12 +151,17 @@ impl Rig {
 impl Drop for Rig {
     fn drop(&mut self) {
         // What a daemon that just ended had asked to be removed may still be going.
-        let remove = |args: &[&str]| Command::new("docker").args(args).output().ok();
-        for id in self.ids() {
-            remove(&["rm", "--force", &id]);
-        }
-        for id in self.images() {
-            remove(&["rmi", "--force", &id]);
+        let docker = |args: &[&str]| Command::new("docker").args(args).output();
+        let filter = format!("label=ictus.federation={}", self.name);
+        for (list, remove) in [
+            (&["ps", "--all", "--quiet"][..], "rm"),
+            (&["images", "--quiet"], "rmi"),
+        ] {
+            let found = docker(&[list, &["--filter", &filter]].concat());
+            let found = found.map(|found| String::from_utf8_lossy(&found.stdout).into_owned());
+            for id in found.unwrap_or_default().lines() {
+                docker(&[remove, "--force", id]).ok();
+            }
         }
     }
 }

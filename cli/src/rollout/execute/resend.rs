@@ -1,6 +1,6 @@
 //! What was there when a host was looked at, and is not when it prepares: it is sent then.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::AtomicU64;
@@ -66,10 +66,10 @@ impl Call {
         let runs = runs.filter(|run| part.federates.contains(&run.id));
         let images = runs.filter_map(|run| run.needs.image.clone());
         // Only what has an id is here.
-        let mut images: Vec<String> = images
+        let images: BTreeSet<String> = images
             .filter(|image| sent_name(key.0, image).is_some())
             .collect();
-        images.dedup();
+        let images: Vec<String> = images.into_iter().collect();
         if images.is_empty() {
             return Ok(sent);
         }

@@ -38,13 +38,15 @@ impl Stages {
             Event::Started { started, .. } => {
                 self.started.insert(host.to_owned(), *started);
                 let started = self.started.values().sum();
-                counted(ui, "started", started, self.of);
+                ui.counted("started", started, self.of);
             }
             Event::Listening { port } => {
                 let at = rti.map_or_else(|| format!("port {port}"), |rti| rti.to_string());
                 ui.stage("started", &format!("the RTI on {host}, listening on {at}"));
             }
-            Event::Joined { joined, of, .. } => counted(ui, "joined", *joined, *of),
+            Event::Joined { joined, of, .. } => {
+                ui.counted("joined", *joined, *of);
+            }
             Event::StartTag { start_ns } => {
                 ui.stage(
                     "agreed",
@@ -54,11 +56,7 @@ impl Stages {
             Event::Running { running, of, .. } => {
                 self.running.insert(host.to_owned(), (*running, *of));
                 let running: usize = self.running.values().map(|it| it.0).sum();
-                if running == self.of {
-                    counted(ui, "running", running, self.of);
-                } else {
-                    ui.progress("running", &format!("{running}/{} federates", self.of));
-                }
+                ui.counted("running", running, self.of);
             }
             Event::Healthy | Event::Ended { .. } => {}
             Event::Rejected { .. }
@@ -74,15 +72,5 @@ impl Stages {
             | Event::Signalled { .. }
             | Event::Foreign { .. } => ui.stage("", &told(host, event)),
         }
-    }
-}
-
-/// A stage that is said once all have reached it.
-fn counted(ui: &mut Ui, stage: &str, reached: usize, of: usize) {
-    let detail = format!("{reached}/{of} federates");
-    if reached == of {
-        ui.stage(stage, &detail);
-    } else {
-        ui.progress(stage, &detail);
     }
 }
