@@ -19,6 +19,7 @@ use crate::session::Session;
 use crate::ui::{Table, Ui};
 
 mod boot;
+mod docker;
 mod keys;
 
 /// What an upgrade sends and keeps while it is under way.
@@ -85,6 +86,9 @@ struct Add {
     /// Have systemd start ictusd there, also while nobody is logged in (a unit of the user's own)
     #[arg(long)]
     at_boot: bool,
+    /// Have root there install Docker where it is missing (Debian, Ubuntu) and let the user in: by root's login, or `sudo` without a password
+    #[arg(long)]
+    install_docker: bool,
 }
 
 #[derive(Debug, Args)]
@@ -140,6 +144,9 @@ impl Add {
             };
             known.insert(at.host.clone(), host);
         })?;
+        if self.install_docker {
+            docker::install(ui, session, at).await?;
+        }
         at.check(ui, session).await
     }
 
