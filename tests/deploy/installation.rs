@@ -15,7 +15,14 @@ pub(crate) const SCENARIOS: &[Scenario] = &[
         "a_docker_that_cannot_be_installed_is_said_with_the_commands",
         a_docker_that_cannot_be_installed_is_said_with_the_commands,
     ),
+    (
+        "a_newer_ictusd_is_not_replaced",
+        a_newer_ictusd_is_not_replaced,
+    ),
 ];
+
+/// Where the program stands, from the user's home.
+const BIN: &str = ".local/share/ictus/bin";
 
 /// Takes the engine's program away, stopped, and the user out of its group.
 fn take_docker(host: &Host) {
@@ -150,4 +157,27 @@ fn a_docker_that_cannot_be_installed_is_said_with_the_commands(rig: &Rig) {
     operator.remove(hosts);
     take_root(host);
     give_docker_back(host);
+}
+
+fn a_newer_ictusd_is_not_replaced(rig: &Rig) {
+    const NEWER: &str = r#"mkdir -p "$1"; cd "$1"; rm -f ictusd; printf '#!/bin/sh\necho ictus 9.1.0\n' >ictusd; chmod 755 ictusd"#;
+    let hosts = &rig.hosts()[..1];
+    let (host, at) = (&hosts[0], target(&hosts[0]));
+    let operator = Operator::new(rig);
+    host.exec_as_robot(&["sh", "-ec", NEWER, "sh", BIN]);
+    let said = operator.fails(&["host", "add", &at, "--accept-new"], 1);
+    for words in ["has ictusd 9.1.0, which is newer than", "`ictus host rm"] {
+        assert!(said.contains(words), "{words} is missing in {said}");
+    }
+    let there = host.exec_as_robot(&["sh", "-c", "cat $1/*", "sh", BIN]);
+    assert!(there.contains("9.1.0"), "it is as it was: {there}");
+    // Nor is one that is older, or broken, in the way.
+    for older in ["s/9.1.0/0.0.9/", "s/echo.*/exit 1/"] {
+        host.exec_as_robot(&["sed", "-i", older, &format!("{BIN}/ictusd")]);
+        operator.add(hosts);
+        host.exec_as_robot(&["sh", "-ec", NEWER, "sh", BIN]);
+    }
+    host.exec_as_robot(&["rm", &format!("{BIN}/ictusd")]);
+    operator.add(hosts);
+    operator.remove(hosts);
 }

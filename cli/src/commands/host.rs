@@ -21,6 +21,7 @@ use crate::ui::{Table, Ui};
 mod boot;
 mod docker;
 mod keys;
+mod version;
 
 /// What an upgrade sends and keeps while it is under way.
 const INSTALLED_NEW: &str = ".local/share/ictus/bin/ictusd.new";
@@ -130,6 +131,7 @@ impl Add {
         for remark in connection.remarks() {
             ui.message(remark);
         }
+        version::refuse_newer(&at.host, &connection, INSTALLED).await?;
         let own = std::env::current_exe().map_err(CliError::failed)?;
         install(ui, &at.host, (&connection, &own, INSTALLED)).await?;
         if self.at_boot {
