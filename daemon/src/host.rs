@@ -530,7 +530,9 @@ fn unreadable_view(name: &str, directory: &Directory, error: &StoreError) -> Fed
             failure: Failure {
                 kind: match error {
                     StoreError::Newer { .. } => FailureKind::NewerRecord,
-                    StoreError::Io { .. } | StoreError::Damaged { .. } => FailureKind::Process,
+                    StoreError::Io { .. }
+                    | StoreError::Others { .. }
+                    | StoreError::Damaged { .. } => FailureKind::Process,
                 },
                 member: None,
                 rank: 0,

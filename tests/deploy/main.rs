@@ -6,6 +6,7 @@
 mod deployments;
 mod hosts;
 mod images;
+mod installation;
 mod killed;
 mod losses;
 mod network;
@@ -36,6 +37,7 @@ const SCENARIOS: &[&[Scenario]] = &[
     killed::SCENARIOS,
     rows::SCENARIOS,
     images::SCENARIOS,
+    installation::SCENARIOS,
     losses::SCENARIOS,
     tls::SCENARIOS,
     system::SCENARIOS,

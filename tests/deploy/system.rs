@@ -81,7 +81,7 @@ fn one_installation_serves_a_whole_host(rig: &Rig) {
     let no_rights = ["host", "add", &target(first), "--system", "--accept-new"];
     let refused = operator.fails(&no_rights, 1);
     assert!(
-        refused.contains("`robot` is not root") && refused.contains("/etc/sudoers.d/ictus"),
+        refused.contains("user `robot` is not root") && refused.contains("/etc/sudoers.d/ictus"),
         "{refused}"
     );
     for host in [first, second] {

@@ -10,6 +10,7 @@ use ictus_deploy::placement::{SshClient, Way};
 use ictus_deploy::ssh::{Connection, HostKey, SshError, Target, host_keys, pin};
 use ictusd::api::part::HostFacts;
 use ictusd::client::Client;
+use ictusd::installation::PROGRAM;
 
 use crate::error::{CliError, Kind};
 use crate::hosts::known::{self, KnownHost};
@@ -19,8 +20,11 @@ use crate::session::Session;
 use crate::ui::{Table, Ui};
 
 mod boot;
+mod docker;
 mod keys;
+mod root;
 mod system;
+mod version;
 
 /// What an upgrade sends and keeps while it is under way.
 const INSTALLED_NEW: &str = ".local/share/ictus/bin/ictusd.new";
@@ -81,12 +85,8 @@ struct At {
 struct Add {
     #[command(flatten)]
     at: At,
-    /// Trust the key that the host shows, without asking
-    #[arg(long)]
-    accept_new: bool,
-    /// Trust the host's key if it has this fingerprint (`SHA256:...`)
-    #[arg(long, value_name = "SHA256:...", conflicts_with = "accept_new")]
-    fingerprint: Option<String>,
+    #[command(flatten)]
+    trust: Trust,
     /// Have systemd start ictusd there, also while nobody is logged in (a unit of the user's own)
     #[arg(long)]
     at_boot: bool,
@@ -94,6 +94,20 @@ struct Add {
     /// root's rights, and federates are a user of their own
     #[arg(long, conflicts_with = "at_boot")]
     system: bool,
+    /// Have root there install Docker where it is missing (Debian, Ubuntu) and let the user in: by root's login, or `sudo` without a password
+    #[arg(long)]
+    install_docker: bool,
+}
+
+/// Which key of a host's is trusted.
+#[derive(Debug, Args)]
+struct Trust {
+    /// Trust the key that the host shows, without asking
+    #[arg(long)]
+    accept_new: bool,
+    /// Trust the host's key if it has this fingerprint (`SHA256:...`)
+    #[arg(long, value_name = "SHA256:...", conflicts_with = "accept_new")]
+    fingerprint: Option<String>,
 }
 
 #[derive(Debug, Args)]
@@ -138,6 +152,8 @@ impl Add {
         for remark in connection.remarks() {
             ui.message(remark);
         }
+        let installed = if self.system { PROGRAM } else { INSTALLED };
+        version::refuse_newer(&at.host, &connection, installed).await?;
         let own = std::env::current_exe().map_err(CliError::failed)?;
         if self.system {
             system::install(ui, (&at.host, &connection), &own).await?;
@@ -156,6 +172,9 @@ impl Add {
             };
             known.insert(at.host.clone(), host);
         })?;
+        if self.install_docker {
+            docker::install(ui, session, at).await?;
+        }
         at.check(ui, session).await
     }
 
@@ -170,12 +189,12 @@ impl Add {
                 &format!("{} {} {}", self.at.host, key.kind, key.fingerprint),
             );
         }
-        let trusted: Vec<&HostKey> = match &self.fingerprint {
+        let trusted: Vec<&HostKey> = match &self.trust.fingerprint {
             Some(wanted) => keys
                 .iter()
                 .filter(|key| key.fingerprint == *wanted)
                 .collect(),
-            None if self.accept_new || confirmed(&self.at.host)? => keys.iter().collect(),
+            None if self.trust.accept_new || confirmed(&self.at.host)? => keys.iter().collect(),
             None => Vec::new(),
         };
         if trusted.is_empty() {

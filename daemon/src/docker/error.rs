@@ -22,7 +22,7 @@ pub(crate) enum EngineError {
     /// There is no socket.
     #[error(
         "no Docker engine: {socket} is not there: install it (`sudo apt-get install docker.io`) or start it \
-         (`sudo systemctl start docker`)",
+         (`sudo systemctl start docker`); `ictus host add HOST --install-docker` does it from elsewhere",
         socket = socket.display()
     )]
     Absent {
@@ -41,7 +41,7 @@ pub(crate) enum EngineError {
     /// The daemon's user may not use the engine.
     #[error(
         "this user (uid {uid}) may not use the Docker engine at {socket}: `sudo usermod -aG docker USER`, log in again \
-         and start ictusd again",
+         and start ictusd again; `ictus host add HOST --install-docker` does it from elsewhere",
         socket = socket.display()
     )]
     Denied {

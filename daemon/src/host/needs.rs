@@ -39,12 +39,14 @@ impl Host {
             let Some(user) = run.needs.user.as_deref().filter(|_| !contained(request)) else {
                 continue;
             };
-            let Some(account) = account(self.paths(), request, run)? else {
-                // Root may have other names.
-                if gives.refuses_root {
-                    let lack = gives.no_root(user);
-                    return Err(refused(&lack.what, &lack.fix));
-                }
+            let account = account(self.paths(), request, run)?;
+            // Root may have other names.
+            let root = account.as_ref().is_none_or(|account| account.uid == 0);
+            if root && gives.refuses_root {
+                let lack = gives.no_root(user);
+                return Err(refused(&lack.what, &lack.fix));
+            }
+            let Some(account) = account else {
                 continue;
             };
             let parent = self.paths().state.parent();

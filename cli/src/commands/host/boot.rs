@@ -4,6 +4,7 @@ use std::io::Write;
 
 use ictus_deploy::ssh::Connection;
 
+use super::root::holds;
 use super::run;
 use crate::error::CliError;
 use crate::hosts::unreachable_host;
@@ -61,11 +62,7 @@ pub(super) async fn remove(host: &str, connection: &Connection) -> Result<(), Cl
 
 /// Whether systemd is what runs there, and not only installed.
 pub(super) async fn has_systemd(host: &str, connection: &Connection) -> Result<bool, CliError> {
-    let there = connection
-        .run(&["test", "-d", "/run/systemd/system"], &[])
-        .await;
-    let there = there.map_err(|error| unreachable_host(host, &error))?;
-    Ok(there.code == 0)
+    holds(host, connection, &["test", "-d", "/run/systemd/system"]).await
 }
 
 #[cfg(test)]

@@ -6,6 +6,7 @@ use std::path::Path;
 use ictus_deploy::ssh::Connection;
 use ictusd::installation::{CONFIG, GROUP, PROGRAM, PROGRAMS, RUN, RUN_AS, STATE};
 
+use super::root::{By, holds, powerless};
 use super::{boot, run, send};
 use crate::error::CliError;
 use crate::hosts::{INSTALLED, unreachable_host};
@@ -22,50 +23,38 @@ const CONFIG_TEXT: &str = include_str!("ictusd.toml");
 const PROGRAM_NEW: &str = "/usr/local/lib/ictus/ictusd.new";
 const PROGRAM_OLD: &str = "/usr/local/lib/ictus/ictusd.old";
 
-/// Whoever logs in, as root: by itself, or by a `sudo` that asks nothing.
+/// A host on which whoever logs in may be root.
 pub(super) struct Root<'c> {
     host: &'c str,
     connection: &'c Connection,
-    sudo: bool,
+    by: By,
 }
 
 impl<'c> Root<'c> {
     /// Finds out how.
     pub(super) async fn of(host: &'c str, connection: &'c Connection) -> Result<Self, CliError> {
-        let uid = run(host, connection, &["id", "-u"]).await?;
-        let sudo = uid.trim_ascii() != b"0";
-        let root = Self {
-            host,
-            connection,
-            sudo,
-        };
-        if sudo && !root.holds(&["true"]).await? {
+        let Some(by) = By::of(host, connection).await? else {
             let user = &connection.peer().user;
-            let message =
-                format!("host `{host}`: `{user}` is not root, and has no `sudo` that asks nothing");
-            return Err(CliError::failed(message).hint(format!(
+            return Err(CliError::failed(powerless(host, connection)).hint(format!(
                 "log in as root, or have root write `{user} ALL=(ALL) NOPASSWD: ALL` into /etc/sudoers.d/ictus there"
             )));
-        }
-        Ok(root)
-    }
-
-    fn command<'w>(&self, command: &[&'w str]) -> Vec<&'w str> {
-        let by: &[&str] = if self.sudo { &["sudo", "-n"] } else { &[] };
-        [by, command].concat()
+        };
+        Ok(Self {
+            host,
+            connection,
+            by,
+        })
     }
 
     /// Runs a command that has to succeed.
     async fn run(&self, command: &[&str]) -> Result<(), CliError> {
-        let done = run(self.host, self.connection, &self.command(command)).await;
+        let done = run(self.host, self.connection, &self.by.command(command)).await;
         done.map(drop)
     }
 
     /// Whether a command succeeds.
     async fn holds(&self, command: &[&str]) -> Result<bool, CliError> {
-        let done = self.connection.run(&self.command(command), &[]).await;
-        let done = done.map_err(|error| unreachable_host(self.host, &error))?;
-        Ok(done.code == 0)
+        holds(self.host, self.connection, &self.by.command(command)).await
     }
 
     /// Puts a file there that whoever logs in has sent.
@@ -81,8 +70,7 @@ pub(super) async fn install(
     program: &Path,
 ) -> Result<(), CliError> {
     let root = Root::of(host, connection).await?;
-    let own = connection.run(&["test", "-e", INSTALLED], &[]).await;
-    if own.is_ok_and(|output| output.code == 0) {
+    if holds(host, connection, &["test", "-e", INSTALLED]).await? {
         let user = &connection.peer().user;
         let message = format!("host `{host}`: `{user}` has an ictusd of its own at ~/{INSTALLED}");
         let hint = format!("`ictus host rm {host}` removes that one");
@@ -123,7 +111,7 @@ async fn make_accounts(root: &Root<'_>) -> Result<(), CliError> {
         let shell = ["--shell", "/usr/sbin/nologin", RUN_AS];
         root.run(&[add, nowhere, shell].concat()).await?;
     }
-    if root.sudo {
+    if root.by == By::Sudo {
         let user = root.connection.peer().user.as_str();
         let join = ["/usr/sbin/usermod", "--append", "--groups", GROUP, user];
         root.run(&join).await?;
