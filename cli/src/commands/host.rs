@@ -21,6 +21,7 @@ use crate::ui::{Table, Ui};
 mod boot;
 mod docker;
 mod keys;
+mod packed;
 mod version;
 
 /// What an upgrade sends and keeps while it is under way.
@@ -298,15 +299,18 @@ async fn install(
     let program = program_for(name, own, &machine)?;
     run(name, connection, &["mkdir", "-p", DIRECTORIES[0]]).await?;
     let whole = std::fs::metadata(&program).map_or(0, |found| found.len());
-    let mut told = |sent: u64| {
+    let mut told = |sent: u64, of: u64| {
         ui.progress(
             "sending",
-            &format!("{name}: {} of {}", size(sent), size(whole)),
+            &format!("{name}: {} of {}", size(sent), size(of)),
         );
     };
-    let sent = connection.upload(&program, to, 0o755, &mut told).await;
-    sent.map_err(|error| unreachable_host(name, &error))?;
-    ui.stage("installed", &format!("{name}: ~/{to} ({})", size(whole)));
+    let sent = packed::send((name, connection), &program, to, &mut told).await?;
+    let (whole, sent) = (size(whole), size(sent));
+    ui.stage(
+        "installed",
+        &format!("{name}: ~/{to} ({whole}, {sent} sent)"),
+    );
     Ok(())
 }
 
