@@ -1,6 +1,12 @@
 //! What `ictus host add` puts on a host, and what it does there as root.
 
+#![expect(clippy::unwrap_used, reason = "a test stops at the first surprise")]
+
+use std::fs;
+
+use ictus_tests::ictus;
 use ictus_tests::rig::{Host, Rig};
+use sha2::{Digest, Sha256};
 
 use super::Scenario;
 use super::operator::{Operator, target};
@@ -18,6 +24,10 @@ pub(crate) const SCENARIOS: &[Scenario] = &[
     (
         "a_newer_ictusd_is_not_replaced",
         a_newer_ictusd_is_not_replaced,
+    ),
+    (
+        "a_program_is_sent_compressed_and_arrives_whole_or_not_at_all",
+        a_program_is_sent_compressed_and_arrives_whole_or_not_at_all,
     ),
 ];
 
@@ -179,5 +189,51 @@ fn a_newer_ictusd_is_not_replaced(rig: &Rig) {
     }
     host.exec_as_robot(&["rm", &format!("{BIN}/ictusd")]);
     operator.add(hosts);
+    operator.remove(hosts);
+}
+
+fn a_program_is_sent_compressed_and_arrives_whole_or_not_at_all(rig: &Rig) {
+    /// A `gzip` of which only this much works.
+    const GZIP: &str =
+        r#"printf '#!/bin/sh\n%s\n' "$1" >/usr/local/bin/gzip; chmod 755 /usr/local/bin/gzip"#;
+    let hosts = &rig.hosts()[..1];
+    let (host, at) = (&hosts[0], target(&hosts[0]));
+    let operator = Operator::new(rig);
+    let program = fs::read(ictus()).unwrap();
+    let digest: String = Sha256::digest(&program)
+        .iter()
+        .map(|byte| format!("{byte:02x}"))
+        .collect();
+    // What is there, with its mode.
+    let there = || {
+        let script = r#"cd "$1"; sha256sum *; stat -c %a *"#;
+        host.exec_as_robot(&["sh", "-ec", script, "sh", BIN])
+    };
+    let whole = format!("{digest}  ictusd\n755\n");
+    let megabytes = |text: &str| -> f64 {
+        let (_, rest) = text.split_once(&format!("{BIN}/ictusd (")).unwrap();
+        let (_, sent) = rest.split_once(" MB, ").unwrap();
+        sent.split(' ').next().unwrap().parse().unwrap()
+    };
+    let add = ["host", "add", &at, "--accept-new"];
+    let sent = megabytes(&operator.ok(&add));
+    assert_eq!(there(), whole);
+
+    host.exec(&["sh", "-c", GZIP, "sh", "exit 1"]);
+    let plain = megabytes(&operator.ok(&add));
+    assert!(sent < plain * 0.6, "{sent} of {plain}");
+    assert_eq!(there(), whole);
+
+    let broken = r#"[ "$1" = --version ] || { echo no space >&2; exit 1; }"#;
+    host.exec(&["sh", "-c", GZIP, "sh", broken]);
+    let said = operator.fails(&add, 1);
+    assert!(said.contains("failed: no space"), "{said}");
+    assert_eq!(
+        there(),
+        whole,
+        "what was there is there, and nothing beside it"
+    );
+
+    host.exec(&["rm", "/usr/local/bin/gzip"]);
     operator.remove(hosts);
 }

@@ -22,6 +22,7 @@ use crate::ui::{Table, Ui};
 mod boot;
 mod docker;
 mod keys;
+mod packed;
 mod root;
 mod system;
 mod version;
@@ -333,30 +334,29 @@ async fn install(
     (connection, own, to): (&Connection, &Path, &str),
 ) -> Result<(), CliError> {
     run(name, connection, &["mkdir", "-p", DIRECTORIES[0]]).await?;
-    let whole = send(ui, name, (connection, own, to)).await?;
-    ui.stage("installed", &format!("{name}: ~/{to} ({})", size(whole)));
+    let sizes = send(ui, name, (connection, own, to)).await?;
+    ui.stage("installed", &format!("{name}: ~/{to} ({sizes})"));
     Ok(())
 }
 
-/// Sends a program, or its like for the host's processor; gives its size.
+/// Sends a program, or its like for the host's processor; gives its size, and how much of it was sent.
 async fn send(
     ui: &mut Ui,
     name: &str,
     (connection, own, to): (&Connection, &Path, &str),
-) -> Result<u64, CliError> {
+) -> Result<String, CliError> {
     let said = run(name, connection, &["uname", "-m"]).await?;
     let machine = String::from_utf8_lossy(&said).trim().to_owned();
     let program = program_for(name, own, &machine)?;
     let whole = std::fs::metadata(&program).map_or(0, |found| found.len());
-    let mut told = |sent: u64| {
+    let mut told = |sent: u64, of: u64| {
         ui.progress(
             "sending",
-            &format!("{name}: {} of {}", size(sent), size(whole)),
+            &format!("{name}: {} of {}", size(sent), size(of)),
         );
     };
-    let sent = connection.upload(&program, to, 0o755, &mut told).await;
-    sent.map_err(|error| unreachable_host(name, &error))?;
-    Ok(whole)
+    let sent = packed::send((name, connection), &program, to, &mut told).await?;
+    Ok(format!("{}, {} sent", size(whole), size(sent)))
 }
 
 /// The hosts that were added.

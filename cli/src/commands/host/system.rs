@@ -131,7 +131,10 @@ async fn with_sent(
     let directory = String::from_utf8_lossy(&made).trim().to_owned();
     let sent = format!("{directory}/sent");
     let done = match send(ui, host, (connection, program, &sent)).await {
-        Ok(_) => then(&sent).await,
+        Ok(sizes) => {
+            ui.stage("sent", &format!("{host}: {sizes}"));
+            then(&sent).await
+        }
         Err(error) => Err(error),
     };
     // The first error is the one to tell.
