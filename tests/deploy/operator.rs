@@ -48,10 +48,10 @@ impl<'r> Operator<'r> {
 
     /// Gets these hosts ready.
     pub(crate) fn add(&self, hosts: &[Host]) {
-        for host in hosts {
+        at_once(hosts, |host| {
             let said = self.ok(&["host", "add", &target(host), "--accept-new"]);
             assert!(said.contains("ictusd"), "{said}");
-        }
+        });
     }
 
     /// `ictus ARGS`, bounded in time.
@@ -110,10 +110,16 @@ impl<'r> Operator<'r> {
 
     /// The same for these hosts.
     pub(crate) fn remove(self, hosts: &[Host]) {
-        for host in hosts {
-            self.ok(&["host", "rm", &target(host)]);
-        }
+        at_once(hosts, |host| drop(self.ok(&["host", "rm", &target(host)])));
     }
+}
+
+fn at_once(hosts: &[Host], each: impl Fn(&Host) + Sync) {
+    std::thread::scope(|scope| {
+        for host in hosts {
+            scope.spawn(|| each(host));
+        }
+    });
 }
 
 pub(crate) fn target(host: &Host) -> String {

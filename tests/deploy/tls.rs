@@ -30,7 +30,7 @@ pub(crate) fn diamond(operator: &Operator<'_>, head: &str, more: &str) -> String
 fn messages_between_hosts_are_under_tls(rig: &Rig) {
     let operator = Operator::with_hosts(rig);
     let file = diamond(&operator, "", "");
-    let up = ["up", &file, "--set", "run=20 s", "--trace"];
+    let up = ["up", &file, "--set", "run=10 s", "--trace"];
     timed(&operator, "mtls", &up);
     // Other certificates would be made, and are no change.
     let again = operator.ok(&up);
@@ -68,7 +68,7 @@ fn containers_of_a_decentralized_federation_meet_under_tls(rig: &Rig) {
     let operator = Operator::with_hosts(rig);
     let head = "coordination: decentralized\ndefaults: { stp_offset: 3 s }\n";
     let file = diamond(&operator, head, ", engine: docker");
-    let up = ["up", &file, "--set", "run=12 s", "--trace"];
+    let up = ["up", &file, "--set", "run=6 s", "--trace"];
     timed(&operator, "mtls", &up);
     for host in rig.hosts() {
         let ids = host.docker(&["ps", "-q"]);

@@ -46,9 +46,9 @@ else
 fi
 
 echo '## files'
-# Docker's own run-time files come and go with its containers, which are listed above.
+# Docker's own run-time files come and go with its containers, which are listed above; sudo's tell who asked it.
 # /run/mount is what mount(8) makes when it is first used.
 find /home /root /tmp /var/tmp /dev/shm /run /srv /opt /usr/local /etc /var/lib/ictus /var/spool \
-    \( -path /run/docker -o -path /run/containerd -o -path /run/docker.pid -o -path /run/xtables.lock -o -path /run/mount \
+    \( -path /run/docker -o -path /run/sudo -o -path /run/containerd -o -path /run/docker.pid -o -path /run/xtables.lock -o -path /run/mount \
     -o -path /etc/hosts -o -path /etc/resolv.conf \) -prune -o \
     \( -type f ! -path '/run/*' -printf '%M %u %p %s bytes\n' -o -printf '%M %u %p\n' \) 2>/dev/null || true

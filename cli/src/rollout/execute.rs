@@ -32,7 +32,7 @@ use resend::Stock;
 use stages::Stages;
 
 /// How long a lease lasts without renewal: who is gone for so long has gone.
-const LEASE_TTL: Duration = Duration::from_secs(30);
+const LEASE_TTL: Duration = Duration::from_secs(20);
 /// How often leases are renewed.
 const RENEWAL: Duration = Duration::from_secs(8);
 
