@@ -2,6 +2,7 @@
 
 use std::io::{IsTerminal, Write};
 use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
 
 use clap::{Args, Subcommand};
 use ictus_deploy::gives::{Denied, Gives, ranges};
@@ -30,6 +31,10 @@ mod version;
 /// What an upgrade sends and keeps while it is under way.
 const INSTALLED_NEW: &str = ".local/share/ictus/bin/ictusd.new";
 const INSTALLED_OLD: &str = ".local/share/ictus/bin/ictusd.old";
+
+/// How long an ictusd that was asked to may take to end.
+const ENDING_MAX: Duration = Duration::from_secs(10);
+const ENDING_PERIOD: Duration = Duration::from_millis(20);
 
 /// Who is let in on a host.
 const AUTHORIZED_KEYS: &str = ".ssh/authorized_keys";
@@ -284,10 +289,19 @@ impl At {
         for name in client.names().await? {
             client.remove(&name, true).await?;
         }
+        let pid = client.info().await?.pid;
         if !client.end().await? {
             let message = format!("host `{}`: somebody deploys to it", self.host);
             return Err(CliError::new(Kind::Held, message)
                 .hint(format!("`ictus lock --host {}` shows who", self.host)));
+        }
+        // It removes what it kept as the last thing it does.
+        let process = format!("/proc/{pid}");
+        let until = Instant::now() + ENDING_MAX;
+        while Instant::now() < until
+            && root::holds(&self.host, &connection, &["test", "-e", &process]).await?
+        {
+            tokio::time::sleep(ENDING_PERIOD).await;
         }
         if let Some(root) = root {
             system::remove(&root).await?;
