@@ -118,7 +118,7 @@ fn one_installation_serves_a_whole_host(rig: &Rig) {
     assert!(operator.parts(&file).iter().all(running));
     operator.ok(&["down", &file, "--purge"]);
     let file = diamond(&operator, "", ", engine: docker");
-    operator.ok(&["up", &file, "--set", "run=6 s", "--trace"]);
+    operator.ok(&["up", &file, "--set", "run=4 s", "--trace"]);
     let numbers = first.script("echo $(id -u ictus-run):$(id -g ictus-run)", &[]);
     let ids = first.docker(&["ps", "-q"]);
     let ids: Vec<_> = ids.lines().collect();

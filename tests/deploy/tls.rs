@@ -30,7 +30,7 @@ pub(crate) fn diamond(operator: &Operator<'_>, head: &str, more: &str) -> String
 fn messages_between_hosts_are_under_tls(rig: &Rig) {
     let operator = Operator::with_hosts(rig);
     let file = diamond(&operator, "", "");
-    let up = ["up", &file, "--set", "run=10 s", "--trace"];
+    let up = ["up", &file, "--set", "run=7 s", "--trace"];
     timed(&operator, "mtls", &up);
     // Other certificates would be made, and are no change.
     let again = operator.ok(&up);
